@@ -1,3 +1,5 @@
+"""Build script of quadvel_description; setup.cfg has the metadata."""
+
 from setuptools import setup
 
 setup()

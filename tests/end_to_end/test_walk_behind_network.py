@@ -104,11 +104,11 @@ class BehindNetwork:
         self._back.send(wire.encode_state(BoardState(state, twelve, twelve, twelve)), self.time)
 
     def _exchange(self) -> None:
-        self._wire.came.extend(self._back.arrived(self.time))
+        self._wire.came.extend(self._back.pop_arrived(self.time))
         self.link.serve()
         while self._wire.sent:
             self._there.send(self._wire.sent.popleft(), self.time)
-        for packet in self._there.arrived(self.time):
+        for packet in self._there.pop_arrived(self.time):
             if not self._warming_up:
                 self._simulator.command(wire.decode_command(packet))
 

@@ -7,7 +7,7 @@ import onnxruntime
 import pytest
 from onnx import ModelProto, TensorProto, helper, numpy_helper
 
-from quadvel_description.ahead import cut
+from quadvel_description.ahead import split_network
 
 MEMORY = 4
 INPUTS = {"obs": (1, 3), "h_in": (1, 1, 2 * MEMORY), "c_in": (1, 1, MEMORY)}
@@ -83,7 +83,7 @@ def run(model: ModelProto, given: dict[str, np.ndarray]) -> dict[str, np.ndarray
 def test_both_parts_together_are_the_network(model: ModelProto) -> None:
     rng = np.random.default_rng(1)
     given = {name: rng.normal(size=shape).astype(np.float32) for name, shape in INPUTS.items()}
-    parts = cut(model, "obs")
+    parts = split_network(model, "obs")
     assert parts is not None
     ahead = run(parts[0], {name: value for name, value in given.items() if name != "obs"})
     found, expected = run(parts[1], given | ahead), run(model, given)
@@ -98,7 +98,7 @@ def test_both_parts_together_are_the_network(model: ModelProto) -> None:
     ids=["all awaits", "nothing awaits", "a scaled product"],
 )
 def test_a_network_without_a_product_of_both_kinds_stays_whole(model: ModelProto) -> None:
-    assert cut(model, "obs") is None
+    assert split_network(model, "obs") is None
 
 
 def test_products_of_deeply_nested_parts_are_followed() -> None:
@@ -111,4 +111,4 @@ def test_products_of_deeply_nested_parts_are_followed() -> None:
     nodes = [*model.graph.node[: joining + 1], *deep, *model.graph.node[joining + 1 :]]
     del model.graph.node[:]
     model.graph.node.extend(nodes)
-    assert cut(model, "obs") is not None
+    assert split_network(model, "obs") is not None

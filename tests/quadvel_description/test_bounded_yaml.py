@@ -10,7 +10,7 @@ import pytest
 from quadvel_actuator import ActuatorParameters
 from quadvel_bringup.plant import read_plant
 from quadvel_dds.arguments import read_parameter_file
-from quadvel_description.bounded_yaml import DEEPEST, LARGEST, load_yaml
+from quadvel_description.bounded_yaml import MAX_CHARACTERS, MAX_DEPTH, load_yaml
 from quadvel_driver.calibration import Calibration
 from quadvel_sim.world import World
 
@@ -26,7 +26,7 @@ HOSTILE = {
     "base 60": ("1:" * 50_000 + "1", "characters"),
     "many digits": ("9" * 5_000, "digits"),
     "no date": ("2001-99-99", "(month|ros__parameters)"),
-    "length": ("a: 1\n" * (LARGEST // 4), "characters"),
+    "length": ("a: 1\n" * (MAX_CHARACTERS // 4), "characters"),
     "tag of Python": ("!!python/object/apply:os.system [x]", "tag"),
 }
 READERS: dict[str, Callable[[Path], object]] = {
@@ -54,5 +54,5 @@ def test_a_few_aliases_are_read() -> None:
 
 
 def test_usual_depth_is_read() -> None:
-    depth = DEEPEST - 1
+    depth = MAX_DEPTH - 1
     assert load_yaml("[" * depth + "1" + "]" * depth)

@@ -26,21 +26,21 @@ def test_the_robot_weighs_what_its_links_weigh():
 
 
 def test_the_trunk_carries_its_hip_rotors_and_the_imu():
-    trunk = robot.lumped("trunk")
+    trunk = robot.combined_inertial("trunk")
     assert trunk.mass == pytest.approx(12.228 + 0.001)
     np.testing.assert_allclose(trunk.com, (0.008390, 0.003656, 0.000260), atol=1e-6)
     inertia = (0.054026921, 0.258759810, 0.284296015, 0.001684806, 0.000234603, 0.000119200)
     imu = (1e-4, 1e-4, 1e-4, 0, 0, 0)
-    np.testing.assert_allclose(trunk.full(), np.add(inertia, imu), atol=2e-7)
+    np.testing.assert_allclose(trunk.fullinertia(), np.add(inertia, imu), atol=2e-7)
 
 
 @pytest.mark.parametrize("name", LUMPED)
 def test_links_carry_their_rotors(name):
     mass, com, micro = LUMPED[name]
-    lumped = robot.lumped(name)
+    lumped = robot.combined_inertial(name)
     assert lumped.mass == pytest.approx(mass, abs=1e-9)
     np.testing.assert_allclose(lumped.com, com, atol=1e-6)
-    np.testing.assert_allclose(np.array(lumped.full()) * 1e6, micro, atol=1e-3)
+    np.testing.assert_allclose(np.array(lumped.fullinertia()) * 1e6, micro, atol=1e-3)
 
 
 def test_every_inertia_is_that_of_a_real_body():

@@ -30,7 +30,7 @@ def test_a_scan_is_made_from_the_sensor_s_pose() -> None:
 
 def test_scanner_faults_have_the_configured_frequency() -> None:
     noisy = Laser(
-        rays=20000, angle_increment=1e-4, noise=0.02, noise_share=0.0, lost=0.1, mixed=0.0, nothing=0.0
+        rays=20000, angle_increment=1e-4, noise=0.02, noise_share=0.0, lost=0.1, mixed=0.0, no_return=0.0
     )
     ranges = noisy.scan(
         FloorPlan(segments=[[-50, -50, 50, -50]]), np.array([0, -45, 0.0]), np.random.default_rng(1)

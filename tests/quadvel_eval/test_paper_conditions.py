@@ -17,7 +17,7 @@ from quadvel_eval.paper.robustness import Robustness, conditions
 from quadvel_eval.paper.section import Study
 from quadvel_eval.paper.slopes import MAX_FOLLOWING_ERROR, STARTS, TITLES, Slopes
 from quadvel_eval.segments import Segment
-from quadvel_sim.physics import SECOND
+from quadvel_sim.physics import HELD_OUT_PHYSICS
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 
 
@@ -105,7 +105,7 @@ def test_robots_walk_on_slopes_after_both_starts_on_every_plant() -> None:
     plants = {
         (plant.get("physics"), "joint_friction" in plant) for plant in (job.call[1].plant for job in jobs)
     }
-    assert plants == {(None, False), (SECOND, False), (SECOND, True)}
+    assert plants == {(None, False), (HELD_OUT_PHYSICS, False), (HELD_OUT_PHYSICS, True)}
 
 
 def test_a_robot_that_falls_while_it_stands_has_fallen(monkeypatch: pytest.MonkeyPatch) -> None:

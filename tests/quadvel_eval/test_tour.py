@@ -16,7 +16,7 @@ from quadvel_eval.following.obstacles import PERSON_RADIUS_M, Clearances, outlin
 from quadvel_eval.following.tour import Outcome, TourSample, TourSetup, summarise_tour
 from quadvel_eval.following.tour_cli import run_tour
 from quadvel_eval.following.tour_report import tour_figure
-from quadvel_follow.follow_planner import PERIOD, FollowConfig, State
+from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, State
 from quadvel_sim.world import Box, Trees, Wall, World
 
 CONFIG = FollowConfig(length=0.6, width=0.4)
@@ -53,7 +53,7 @@ def moment(time: float, away: float, state: State = State.FOLLOWING) -> TourSamp
 def test_figures_have_errors_distance_and_losses_without_the_start() -> None:
     states = 140 * [State.FOLLOWING] + 20 * [State.LOST] + 20 * [State.LOOKING] + 20 * [State.FOLLOWING]
     away = np.where(np.arange(200) < 120, 9.0, np.where(np.arange(200) < 180, 1.6, 3.0))
-    moments = [moment(PERIOD * k, float(d), s) for k, (d, s) in enumerate(zip(away, states, strict=True))]
+    moments = [moment(PERIOD_S * k, float(d), s) for k, (d, s) in enumerate(zip(away, states, strict=True))]
     outcome = Outcome(
         world="w",
         seed=0,
@@ -90,7 +90,7 @@ def test_some_metres_down_the_corridor_behind_a_person(tmp_path: Path) -> None:
 
 def test_the_picture_counts_minutes_from_its_first_moment(tmp_path: Path) -> None:
     """Of a run in real time the moments are seconds since 1970."""
-    moments = [moment(1.8e9 + PERIOD * k, 1.5) for k in range(1200)]
+    moments = [moment(1.8e9 + PERIOD_S * k, 1.5) for k in range(1200)]
     figure = tour_figure(World.load("corridor"), 1.5, moments)
     below = next(axes for axes in figure.axes if axes.get_xlabel() == "min")
     assert below.get_xlim() == pytest.approx((0.0, 1.0), abs=0.01)

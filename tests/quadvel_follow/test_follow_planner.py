@@ -10,7 +10,7 @@ import pytest
 from quadvel_eval.following.scenes import FollowScene
 from quadvel_eval.following.stage import LASER, FollowSample, FollowSimulation
 from quadvel_eval.people.laser import FloorPlan
-from quadvel_follow.follow_planner import PERIOD, FollowConfig, FollowPlanner, Plan, State
+from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, FollowPlanner, Plan, State
 from quadvel_follow.leg_detector import LegDetector
 from quadvel_sim.walker import Walker
 
@@ -54,16 +54,16 @@ class Bench:
         self.pose = np.zeros(3)
 
     def step(
-        self, person: tuple[float, ...] | None, ranges: np.ndarray = OPEN, seconds: float = PERIOD
+        self, person: tuple[float, ...] | None, ranges: np.ndarray = OPEN, seconds: float = PERIOD_S
     ) -> list:
         """The plans of so many seconds, the robot being where it is commanded to be."""
         plans: list[Plan] = []
-        for _ in range(round(seconds / PERIOD)):
-            self.now += PERIOD
+        for _ in range(round(seconds / PERIOD_S)):
+            self.now += PERIOD_S
             velocity = plans[-1].velocity if plans else np.zeros(3)
             c, s = np.cos(self.pose[2]), np.sin(self.pose[2])
             ahead = [c * velocity[0] - s * velocity[1], s * velocity[0] + c * velocity[1], velocity[2]]
-            self.pose = self.pose + PERIOD * np.array(ahead)
+            self.pose = self.pose + PERIOD_S * np.array(ahead)
             self.planner.on_odometry(self.now, self.now, self.pose.tolist(), velocity)
             self.planner.on_scan(self.now, self.now, ranges, LASER.angle_min, LASER.angle_increment)
             if person is not None:
@@ -95,8 +95,8 @@ def test_commands_change_no_faster_than_they_may() -> None:
     bench = Bench()
     plans = bench.step((6.0, 1.0, 0.0, 0.0), seconds=3.0)
     commands = np.array([plan.velocity for plan in plans])
-    steps = np.abs(np.diff(commands, axis=0)) / PERIOD
-    assert {plan.words for plan in plans} == {"follows"}
+    steps = np.abs(np.diff(commands, axis=0)) / PERIOD_S
+    assert {plan.reason for plan in plans} == {"follows"}
     assert (steps < np.maximum(FollowConfig().acceleration, FollowConfig().deceleration) + 1e-6).all()
     assert commands[:, 0].max() > 1.0
 

@@ -40,7 +40,7 @@ def test_both_legs_are_found_at_any_resolution(detector: LegDetector, degrees: f
 
 @pytest.mark.parametrize("nothing", [0.0, -np.inf, np.inf, np.nan, 12.0])
 def test_however_a_scanner_says_that_there_was_nothing(detector: LegDetector, nothing: float) -> None:
-    laser = around(0.5, nothing=nothing, lost=0.02)
+    laser = around(0.5, no_return=nothing, lost=0.02)
     circles = [[*leg, 0.06] for leg in LEGS]
     ranges = laser.scan(FloorPlan(circles), np.zeros(3), np.random.default_rng(0))
     found = detector.detect(ranges, laser.angle_min, laser.angle_increment)

@@ -19,7 +19,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from quadvel_eval.people.laser import FloorPlan, Laser
 from quadvel_eval.people.scenes import Scene
 from quadvel_follow import person_tracker_node
-from quadvel_follow.looking import to_frame
+from quadvel_follow.free_space import to_frame
 from quadvel_msgs.srv import SelectPerson
 from quadvel_sim.walker import Walker
 
@@ -152,7 +152,7 @@ def test_nobody_is_meant_before_select_person_is_asked(bench: Bench) -> None:
     assert not refused.success
     assert "id is 999, expected one that is tracked" in refused.message
     answer = bench.ask(0)
-    assert (answer.success, answer.message) == (True, f"person {answer.selected} is meant now")
+    assert (answer.success, answer.message) == (True, f"person {answer.selected} is selected")
     feed(bench, None, 1.0, start=103.0)
     bench.wait(lambda: bench.heard["person/odometry"])
     assert bench.heard["person/odometry"][-1].child_frame_id == f"person_{answer.selected}"

@@ -7,7 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quadvel_follow.trajectory import RECEIVER_NOISE, SHIPPED, STEP, Trajectory, TrajectoryFollower, load
+from quadvel_follow.trajectory import (
+    RECEIVER_NOISE,
+    SHIPPED_FOLDER,
+    STEP_S,
+    Trajectory,
+    TrajectoryFollower,
+    load_trajectory,
+)
 
 Array = np.ndarray
 
@@ -17,14 +24,14 @@ def walked(follower: TrajectoryFollower, start: np.ndarray, drift: np.ndarray) -
     pose, time = start.copy(), 0.0
     while (velocity := follower.step(time, pose)) is not None:
         vx, vy, wz = velocity + drift
-        c, s = np.cos(pose[2] + 0.5 * STEP * wz), np.sin(pose[2] + 0.5 * STEP * wz)
-        pose = pose + STEP * np.array([c * vx - s * vy, s * vx + c * vy, wz])
-        time += STEP * 1.0000001
+        c, s = np.cos(pose[2] + 0.5 * STEP_S * wz), np.sin(pose[2] + 0.5 * STEP_S * wz)
+        pose = pose + STEP_S * np.array([c * vx - s * vy, s * vx + c * vy, wz])
+        time += STEP_S * 1.0000001
     return pose
 
 
 def test_the_figure_of_eight_ends_where_it_began() -> None:
-    eight = load(SHIPPED / "eight.csv", 0.5)
+    eight = load_trajectory(SHIPPED_FOLDER / "eight.csv", 0.5)
     np.testing.assert_allclose(eight.pose[-1], 0.0, atol=0.03)
     assert np.ptp(eight.pose[:, 1]) == pytest.approx(4.0, abs=0.01)
 
@@ -32,7 +39,7 @@ def test_the_figure_of_eight_ends_where_it_began() -> None:
 def test_places_of_a_csv_are_passed_in_turn(tmp_path: Path) -> None:
     file = tmp_path / "way.csv"
     file.write_text("x,y\n0,0\n2,0\n2,1\n")
-    way = load(file, 0.5)
+    way = load_trajectory(file, 0.5)
     for place in ((2.0, 0.0), (2.0, 1.0)):
         assert np.hypot(*(way.pose[:, :2] - place).T).min() < 0.02
     assert way.seconds == pytest.approx(4.0 + np.pi / 2 + 2.0, abs=0.1)
@@ -44,7 +51,7 @@ def test_points_of_a_gpx_are_metres_from_the_first(tmp_path: Path) -> None:
         '<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>'
         '<trkpt lat="60.0" lon="10.0"/><trkpt lat="60.0" lon="10.0001"/></trkseg></trk></gpx>'
     )
-    np.testing.assert_allclose(load(file, 0.5).pose[-1, :2], [5.56, 0.0], atol=0.02)
+    np.testing.assert_allclose(load_trajectory(file, 0.5).pose[-1, :2], [5.56, 0.0], atol=0.02)
 
 
 def gpx(tmp_path: Path, points: Array) -> Path:
@@ -61,7 +68,7 @@ def gpx(tmp_path: Path, points: Array) -> Path:
 def test_neither_a_pole_nor_the_date_line_stretches_a_gpx(
     tmp_path: Path, first: tuple[float, float], last: tuple[float, float]
 ) -> None:
-    way = load(gpx(tmp_path, np.array([first, last])), 1.0)
+    way = load_trajectory(gpx(tmp_path, np.array([first, last])), 1.0)
     assert 20.0 < np.hypot(*way.pose[-1, :2]) < 23.0
 
 
@@ -84,12 +91,12 @@ def noisy(points: Array, noise: float, seed: int) -> Array:
 
 def on_the_spot(way: Trajectory) -> float:
     """s, in which it turns without walking."""
-    return STEP * float(np.sum(way.velocity[:, 0] < 1e-9))
+    return STEP_S * float(np.sum(way.velocity[:, 0] < 1e-9))
 
 
 def turned(way: Trajectory) -> float:
     """Sum of all turning, rad."""
-    return STEP * float(np.abs(way.velocity[:, 2]).sum())
+    return STEP_S * float(np.abs(way.velocity[:, 2]).sum())
 
 
 EIGHT = np.vstack([arc(2.0, 1.0, 0.1), arc(2.0, 1.0, 0.1)[1:] * [1.0, -1.0]])
@@ -115,8 +122,8 @@ SPIRAL = 0.3 * SPIRAL_ANGLE * np.hstack([np.cos(SPIRAL_ANGLE), np.sin(SPIRAL_ANG
 def test_recorded_paths_are_walked_in_curves_and_nowhere_on_the_spot(
     points: Array, noise: float, length: float, turn: float, seed: int
 ) -> None:
-    way = Trajectory.of_places(np.round(noisy(points, noise, seed), 4), 0.9)
-    assert way.velocity[:, 0].sum() * STEP == pytest.approx(length, rel=0.06)
+    way = Trajectory.from_points(np.round(noisy(points, noise, seed), 4), 0.9)
+    assert way.velocity[:, 0].sum() * STEP_S == pytest.approx(length, rel=0.06)
     assert on_the_spot(way) == 0.0
     assert turned(way) == pytest.approx(turn, rel=0.12, abs=0.4)
     assert np.quantile(way.velocity[:, 0], 0.02) > 0.85
@@ -128,8 +135,8 @@ def test_a_receiver_that_stood_for_minutes_leads_along_the_way_alone(rate: int, 
     before, after = line(40.0, 1.0 / rate), line(40.0, 1.0 / rate) @ [[0.0, 1.0], [-1.0, 0.0]] + [40.0, 0.0]
     stop = np.tile([40.0, 0.0], (180 * rate, 1))
     track = noisy(np.vstack([np.zeros((100 * rate, 2)), before, stop, after]), 0.4, seed)
-    way = Trajectory.of_places(track, 1.0, RECEIVER_NOISE)
-    assert way.velocity[:, 0].sum() * STEP == pytest.approx(80.0, abs=6.0)
+    way = Trajectory.from_points(track, 1.0, RECEIVER_NOISE)
+    assert way.velocity[:, 0].sum() * STEP_S == pytest.approx(80.0, abs=6.0)
     assert turned(way) < 1.57 + 1.2
     assert way.noise == pytest.approx(0.4, rel=0.2)
 
@@ -142,8 +149,8 @@ def test_errors_that_neighbours_share_are_not_taken_for_turns(rate: int, seed: i
     random, wander = np.random.default_rng(seed), np.zeros_like(track)
     for k in range(1, len(track)):
         wander[k] = 0.9 * wander[k - 1] + 0.4 * np.sqrt(1.0 - 0.9**2) * random.normal(size=2)
-    way = Trajectory.of_places(track + wander, 1.0, RECEIVER_NOISE)
-    assert way.velocity[:, 0].sum() * STEP == pytest.approx(72.0, abs=5.0)
+    way = Trajectory.from_points(track + wander, 1.0, RECEIVER_NOISE)
+    assert way.velocity[:, 0].sum() * STEP_S == pytest.approx(72.0, abs=5.0)
     assert turned(way) < 3.0
 
 
@@ -160,27 +167,27 @@ def test_errors_that_neighbours_share_are_not_taken_for_turns(rate: int, seed: i
 def test_written_corners_are_turned_on_the_spot(corners: list[list[float]]) -> None:
     legs = np.diff(np.array(corners, float), axis=0)
     turns = np.abs((np.diff(np.arctan2(legs[:, 1], legs[:, 0])) + np.pi) % (2.0 * np.pi) - np.pi)
-    way = Trajectory.of_places(corners, 0.5)
+    way = Trajectory.from_points(corners, 0.5)
     assert on_the_spot(way) == pytest.approx(turns.sum(), abs=0.02 * len(corners))
     assert way.seconds == pytest.approx(np.hypot(*legs.T).sum() / 0.5 + turns.sum(), rel=0.01)
 
 
 def test_dense_points_keep_a_corner() -> None:
     side = line(2.0, 0.05)
-    way = Trajectory.of_places(np.vstack([side, side[1:] @ [[0.0, 1.0], [-1.0, 0.0]] + [2.0, 0.0]]), 0.5)
+    way = Trajectory.from_points(np.vstack([side, side[1:] @ [[0.0, 1.0], [-1.0, 0.0]] + [2.0, 0.0]]), 0.5)
     assert on_the_spot(way) == pytest.approx(np.pi / 2, abs=0.1)
     assert np.hypot(*(way.pose[:, :2] - [2.0, 0.0]).T).min() < 0.02
 
 
 def test_narrow_curves_are_walked_slower_than_the_robot_turns_fastest() -> None:
-    way = Trajectory.of_places(arc(0.4, 2.0, 0.05), 1.0)
+    way = Trajectory.from_points(arc(0.4, 2.0, 0.05), 1.0)
     assert np.abs(way.velocity[:, 2]).max() <= 1.001
     assert np.median(way.velocity[:, 0]) == pytest.approx(0.4, abs=0.05)
 
 
 def test_before_it_sets_off_it_says_length_duration_and_turning() -> None:
     assert (
-        Trajectory.of_places([[0, 0], [2, 0], [2, 1]], 0.5)
+        Trajectory.from_points([[0, 0], [2, 0], [2, 1]], 0.5)
         .summary()
         .startswith("3.0 m in 7.6 s, turning 1.6")
     )
@@ -200,10 +207,10 @@ def test_a_leap_of_a_gpx_is_refused_by_its_points(
 ) -> None:
     track = [(46.05 + 2e-5 * k, 14.5) for k in range(30)]
     with pytest.raises(ValueError, match=rf"way\.gpx: {words}"):
-        load(gpx(tmp_path, np.array([*points, *track])), 0.5)
+        load_trajectory(gpx(tmp_path, np.array([*points, *track])), 0.5)
     middle = gpx(tmp_path, np.array([*track[:20], (46.06, 14.5), *track[20:], (46.07, 14.5)]))
     with pytest.raises(ValueError, match=r"from point 20 .* to point 21 .*; 3 steps of the file"):
-        load(middle, 0.5)
+        load_trajectory(middle, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -223,12 +230,12 @@ def test_ways_that_are_too_long_are_refused_before_they_take_memory(
     file = tmp_path / "way.csv"
     file.write_text(text)
     with pytest.raises(ValueError, match=rf"way\.csv: .*{words}"):
-        load(file, 0.5)
+        load_trajectory(file, 0.5)
 
 
 def test_a_gpx_beyond_the_poles_is_refused_by_its_point(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"point 2 at \(91, 0\)"):
-        load(gpx(tmp_path, np.array([[90.0, 0.0], [91.0, 0.0]])), 0.5)
+        load_trajectory(gpx(tmp_path, np.array([[90.0, 0.0], [91.0, 0.0]])), 0.5)
 
 
 @pytest.mark.parametrize(
@@ -248,13 +255,13 @@ def test_files_that_are_no_way_are_refused_by_name(tmp_path: Path, text: str, wo
     file = tmp_path / "way.csv"
     file.write_text(text)
     with pytest.raises(ValueError, match=rf"way\.csv: .*({words})"):
-        load(file, 0.5)
+        load_trajectory(file, 0.5)
 
 
 @pytest.mark.parametrize("name", ["missing.csv", "missing.gpx", "."])
 def test_a_file_that_cannot_be_read_is_refused_with_the_shipped_names(tmp_path: Path, name: str) -> None:
     with pytest.raises(ValueError, match="eight, zju") as refused:
-        load(tmp_path / name, 0.5)
+        load_trajectory(tmp_path / name, 0.5)
     assert str(refused.value).startswith(f"{tmp_path / name}: ")
     assert "Errno" not in str(refused.value)
 
@@ -263,11 +270,11 @@ def test_a_gpx_with_entities_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "way.gpx"
     file.write_text('<!DOCTYPE gpx [<!ENTITY a "b">]><gpx/>')
     with pytest.raises(ValueError, match="entities"):
-        load(file, 0.5)
+        load_trajectory(file, 0.5)
 
 
 def test_closed_on_odometry_a_drift_is_corrected_that_open_loop_keeps() -> None:
-    way = Trajectory.of_places([[0.0, 0.0], [4.0, 0.0]], 0.5)
+    way = Trajectory.from_points([[0.0, 0.0], [4.0, 0.0]], 0.5)
     start, drift = np.array([3.0, 1.0, np.pi / 2]), np.array([0.0, 0.05, 0.0])
     end = start[:2] + np.array([0.0, 4.0])
     assert np.hypot(*(walked(TrajectoryFollower(way, False), start, drift)[:2] - end)) > 0.35
@@ -275,7 +282,7 @@ def test_closed_on_odometry_a_drift_is_corrected_that_open_loop_keeps() -> None:
 
 
 def test_a_robot_far_off_its_way_is_given_up() -> None:
-    follower = TrajectoryFollower(load(SHIPPED / "eight.csv", 0.5), True)
+    follower = TrajectoryFollower(load_trajectory(SHIPPED_FOLDER / "eight.csv", 0.5), True)
     follower.step(0.0, np.zeros(3))
     with pytest.raises(ValueError, match=r"2\.00 m off its way"):
         follower.step(0.0, np.array([0.0, 2.0, 0.0]))

@@ -31,7 +31,9 @@ class Stand:
         turned = np.array([np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2)])
         quaternion = np.zeros(4)
         mujoco.mju_mulQuat(quaternion, terrain.tilt, turned)
-        self.simulator.place(attrs.evolve(self.simulator.truth(), quaternion=quaternion), LIE_Q, np.zeros(12))
+        self.simulator.set_state(
+            attrs.evolve(self.simulator.truth(), quaternion=quaternion), LIE_Q, np.zeros(12)
+        )
         self.supervisor = Supervisor(
             make_policy(action_offset=tuple(NOMINAL_Q + sag)), SupervisorConfig(auto_stand=auto_stand)
         )
@@ -95,7 +97,7 @@ def test_it_comes_to_rest_in_stance_with_its_feet_somewhat_off_their_places(
     stand = Stand(make_policy, auto_stand=False)
     stand.simulator.reset("stand")
     off = np.random.default_rng(seed).uniform(-0.15, 0.15, 12)
-    stand.simulator.place(stand.simulator.truth(), NOMINAL_Q + off, np.zeros(12))
+    stand.simulator.set_state(stand.simulator.truth(), NOMINAL_Q + off, np.zeros(12))
     stand.run(0.01)
     assert stand.supervisor.request("stance")[0]
     stand.run(2.0)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from quadvel_sim.bad_network import HELD_BACK, BadNetwork, NetworkConfig
+from quadvel_sim.bad_network import REORDERING_DELAY_S, BadNetwork, NetworkConfig
 
 
 def packet(i: int) -> bytes:
@@ -22,7 +22,7 @@ def passed(packets: int = 2000, way: int = 0, **config: float) -> list[tuple[int
         for step in range(10 * packets + 1000):
             if step % 10 == 0 and step < 10 * packets:
                 network.send(packet(step // 10), 1e-4 * step)
-            for data in network.arrived(1e-4 * step):
+            for data in network.pop_arrived(1e-4 * step):
                 number = int.from_bytes(data[:4], "little")
                 yield number, 1e-4 * step - 1e-3 * number, data
 
@@ -60,7 +60,7 @@ def test_a_share_comes_twice() -> None:
 
 def test_a_share_is_held_back_behind_others() -> None:
     found = passed(network_reordering=0.1)
-    assert sum(delay > 0.9 * HELD_BACK for _, delay, _ in found) == pytest.approx(200, abs=60)
+    assert sum(delay > 0.9 * REORDERING_DELAY_S for _, delay, _ in found) == pytest.approx(200, abs=60)
 
 
 def test_a_share_comes_with_bits_flipped() -> None:

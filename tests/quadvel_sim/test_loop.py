@@ -32,7 +32,7 @@ class Bench:
         self.clock = Clock()
         self.samples: list[tuple[RobotState, float]] = []
         self.waiting: list[tuple[int, float]] = []
-        fields = {"clock": self.clock, "say_waiting": lambda *words: self.waiting.append(words), **fields}
+        fields = {"clock": self.clock, "report_waiting": lambda *words: self.waiting.append(words), **fields}
         self.loop = SimulationLoop(Simulator(config), self.note, mode, period, **fields)
 
     def note(self, state: RobotState, instant: float) -> None:

@@ -49,7 +49,7 @@ def test_each_reaches_the_record_that_it_belongs_to(tmp_path: Path) -> None:
     assert config.noise == SensorNoise(0.0, 0.1, 0.2, 0.3, 0.4)
     assert config.actuator == ActuatorParameters.ideal()
     assert (config.seed, config.payload, config.watchdog, config.watchdog_kd) == (4, 2.0, 0.05, 2.0)
-    assert config.hung
+    assert config.suspended
     np.testing.assert_array_equal(config.friction, 0.5)
     np.testing.assert_array_equal(config.payload_position, [0.1, 0.0, 0.2])
 

@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadvel_sim.physics import SECOND, Physics
+from quadvel_sim.physics import HELD_OUT_PHYSICS, Physics
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 
 
 def test_time_and_weight_are_right_at_any_number_of_steps_a_millisecond() -> None:
-    simulator = Simulator(SimulatorConfig(physics=SECOND))
+    simulator = Simulator(SimulatorConfig(physics=HELD_OUT_PHYSICS))
     simulator.reset("lie")
     simulator.step(1000)
     assert simulator.data.time == pytest.approx(1.0)

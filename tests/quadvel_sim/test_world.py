@@ -23,7 +23,7 @@ from quadvel_sim import Simulator, SimulatorConfig, Terrain, World
 from quadvel_sim.laser import Laser
 from quadvel_sim.persons import Persons
 from quadvel_sim.simulator import build_model
-from quadvel_sim.world import SHIPPED, Box, Hill, Patch, Person, Table, Trees, Wall
+from quadvel_sim.world import SHIPPED_WORLDS, Box, Hill, Patch, Person, Table, Trees, Wall
 
 QUIET = {"noise": 0.0, "noise_share": 0.0, "lost": 0.0, "mixed": 0.0}
 AT_TRUNK = Laser(position=(0.0, 0.0, 0.0), field_of_view=360.0, rays=720, range_max=30.0, **QUIET)
@@ -45,7 +45,7 @@ def turned(simulator: Simulator, x: float, z: float, quaternion: list[float]) ->
         linear_velocity=np.zeros(3),
         angular_velocity=np.zeros(3),
     )
-    simulator.place(truth, robot.NOMINAL_Q, np.zeros(12))
+    simulator.set_state(truth, robot.NOMINAL_Q, np.zeros(12))
 
 
 def about_y(angle: float) -> list[float]:
@@ -96,7 +96,9 @@ def test_a_trunk_that_pitches_by_10_degrees_sees_the_ground_and_only_before_it()
 
 
 def test_a_scan_is_due_once_a_period_and_the_robot_is_not_in_it() -> None:
-    simulator = standing(World(laser=attrs.evolve(AT_TRUNK, rate=40.0, position=(0.0, 0.0, -0.2))), hung=True)
+    simulator = standing(
+        World(laser=attrs.evolve(AT_TRUNK, rate=40.0, position=(0.0, 0.0, -0.2))), suspended=True
+    )
     times = []
     for _ in range(40):
         if (scan := simulator.scan()) is not None:
@@ -168,7 +170,7 @@ def test_a_person_waits_before_the_robot_and_goes_on_once_it_is_gone() -> None:
     turned(simulator, 5.0, 1.0, about_y(0.0))
     simulator.step(200)
     assert simulator.persons()[0, 0] < x - 0.1
-    assert not simulator.touched
+    assert not simulator.touch_counts
 
 
 def test_a_person_walks_rounds_with_its_stops_and_paces() -> None:
@@ -239,7 +241,7 @@ def test_a_hill_carries_the_robot_as_an_endless_slope_does() -> None:
         on_slope(simulator, 15.0, 1.8)
         hold(simulator, 0.1)
         found.append(simulator.truth())
-        assert not simulator.touched
+        assert not simulator.touch_counts
     assert found[0].contact.all()
     np.testing.assert_allclose(found[0].position, found[1].position, atol=1e-4)
     np.testing.assert_allclose(found[0].contact_force, found[1].contact_force, atol=1.0)
@@ -275,11 +277,11 @@ def test_what_the_robot_touches_is_counted_by_name_and_pushes_back() -> None:
     world = World(boxes=[Box(position=[0.3235 + 0.25 - 0.004, 0.0], size=[0.5, 0.5, 1.0])])
     simulator = Simulator(SimulatorConfig(world=world))
     simulator.step(300)
-    assert dict(simulator.touched) == {"box_0": 1}
+    assert dict(simulator.touch_counts) == {"box_0": 1}
     assert simulator.truth().position[0] < -0.001
     assert not simulator.fallen
     simulator.reset()
-    assert not simulator.touched
+    assert not simulator.touch_counts
 
 
 def test_without_a_world_there_is_no_scan_and_nobody() -> None:
@@ -294,7 +296,7 @@ def test_a_world_brings_its_own_ground() -> None:
         SimulatorConfig(world=World(), terrain=Terrain("rough"))
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", SHIPPED_WORLDS)
 def test_a_shipped_world_leads_a_person_who_walks_where_nothing_stands(name: str) -> None:
     world = World.load(name)
     led, *others = world.persons
@@ -315,7 +317,7 @@ def test_a_shipped_world_leads_a_person_who_walks_where_nothing_stands(name: str
         assert gaps.min() > 0.8
     simulator = Simulator(SimulatorConfig(world=world))
     simulator.step(100)
-    assert not simulator.touched
+    assert not simulator.touch_counts
     assert np.hypot(*simulator.persons()[0, :2]) < 2.5
 
 
@@ -363,7 +365,7 @@ REFUSED = {
     ),
     "two led": (
         {"schema": 1, "persons": [{"way": [[0, 1], [2, 3]], "led": True}] * 2},
-        r"persons: found \[0, 1\] led, counted from 0, expected the first or none",
+        r"persons: found `led` at indices \[0, 1\], expected index 0 or none",
     ),
 }
 

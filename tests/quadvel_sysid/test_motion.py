@@ -60,7 +60,7 @@ def _hung(friction, seconds=5.0, seed=0):
     noise = SensorNoise(q=1e-4, dq=0.01)
     simulator = Simulator(
         SimulatorConfig(
-            hung=True, noise=noise, seed=seed, joint_friction=friction, joint_damping=np.full(12, 0.01)
+            suspended=True, noise=noise, seed=seed, joint_friction=friction, joint_damping=np.full(12, 0.01)
         )
     )
     simulator.reset("stand", seed=seed)

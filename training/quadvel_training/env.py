@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf, robot
-from quadvel_description.command_range import within_range
+from quadvel_description.command_range import split_target
 from quadvel_description.kinematics import foot_kinematics, foot_positions, roll_pitch, rotate, rotate_inverse
 from quadvel_policy.observation import CommandLimits
 from quadvel_sim.physics import Physics
@@ -377,7 +377,7 @@ class VelocityEnv:
         q, dq = self._qpos[:, 7:], self._qvel[:, 6:]
         for step in range(self.substeps):
             if step % self._resend == 0:
-                sent, push = within_range(target, gains[0], q)
+                sent, push = split_target(target, gains[0], q)
             if step == self.substeps - 1:
                 before = self._qvel[:, :3].copy()
             self.torque = self.actuators.step(q, dq, sent, *gains, target_speed, push)

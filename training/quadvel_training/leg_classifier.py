@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from quadvel_eval.people.measure import ScanRecording, detection_scores, identity_scores
-from quadvel_follow.clusters import NUMBERS, WINDOW
+from quadvel_follow.clusters import FEATURE_COUNT, WINDOW_OFFSETS_M
 from quadvel_follow.leg_detector import LegDetector
 
 from .leg_examples import Examples, read_examples_file, simulate_examples
@@ -59,10 +59,10 @@ class LegNetwork(nn.Module):
             config: configuration.
         """
         super().__init__()
-        self.register_buffer("mean", torch.zeros(NUMBERS))
-        self.register_buffer("scale", torch.ones(NUMBERS))
+        self.register_buffer("mean", torch.zeros(FEATURE_COUNT))
+        self.register_buffer("scale", torch.ones(FEATURE_COUNT))
         layers: list[nn.Module] = []
-        size = NUMBERS
+        size = FEATURE_COUNT
         for width in config.hidden:
             layers += [nn.Linear(size, width), nn.SiLU(), nn.Dropout(config.dropout)]
             size = width
@@ -146,7 +146,7 @@ class _Draws:
         things = np.concatenate([source.things[which] for source, which in drawn])
         legs = np.concatenate([source.legs[which] for source, which in drawn])
         turned = self._rng.random(len(things)) < 0.5
-        things[turned, : WINDOW.size] = things[turned, WINDOW.size - 1 :: -1]
+        things[turned, : WINDOW_OFFSETS_M.size] = things[turned, WINDOW_OFFSETS_M.size - 1 :: -1]
         return things, legs
 
 
@@ -207,7 +207,7 @@ def export(network: LegNetwork, path: Path, about: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.onnx.export(
         network.eval(),
-        (torch.zeros(2, NUMBERS),),
+        (torch.zeros(2, FEATURE_COUNT),),
         str(part),
         input_names=["things"],
         output_names=["probability"],

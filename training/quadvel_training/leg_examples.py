@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadvel_eval.people.laser import FloorPlan, Laser
-from quadvel_follow.clusters import NUMBERS, WIDEST, Scan, describe, find_clusters
-from quadvel_follow.looking import to_frame
-from quadvel_sim.walker import Walker, circles
+from quadvel_follow.clusters import FEATURE_COUNT, MAX_CLUSTER_WIDTH_M, Scan, cluster_features, find_clusters
+from quadvel_follow.free_space import to_frame
+from quadvel_sim.walker import Walker, leg_circles
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class Examples:
             All examples.
         """
         if not parts:
-            return cls(np.zeros((0, NUMBERS), np.float32), np.zeros(0, bool))
+            return cls(np.zeros((0, FEATURE_COUNT), np.float32), np.zeros(0, bool))
         return cls(np.concatenate([p.things for p in parts]), np.concatenate([p.legs for p in parts]))
 
 
@@ -84,7 +84,7 @@ def _scans(content: dict[str, Any], step: int, rng: np.random.Generator) -> Iter
         kept = ranges[first::step].copy()
         kept += rng.uniform(0.0, 0.015) * rng.standard_normal(kept.size)
         kept[rng.random(kept.size) < rng.choice([0.0, 0.01])] = np.inf
-        yield Scan.checked(kept, float(content["angle_min"]) + first * increment, step * increment)
+        yield Scan.validated(kept, float(content["angle_min"]) + first * increment, step * increment)
 
 
 def _labelled(content: dict[str, Any], step: int, rng: np.random.Generator) -> Iterator[Examples]:
@@ -95,7 +95,9 @@ def _labelled(content: dict[str, Any], step: int, rng: np.random.Generator) -> I
         labels = labels[np.isfinite(labels[:, 0])]
         named = _nearest(clusters.centre, labels) < LABEL_RADIUS_M
         yield _select_examples(
-            scan, named, named | (fixed(clusters.centre) & (_nearest(clusters.centre, labels) > WIDEST))
+            scan,
+            named,
+            named | (fixed(clusters.centre) & (_nearest(clusters.centre, labels) > MAX_CLUSTER_WIDTH_M)),
         )
 
 
@@ -117,13 +119,13 @@ def _walking(content: dict[str, Any], step: int, rng: np.random.Generator) -> It
         bearing = np.arctan2(*clusters.centre.T[::-1])
         nearer = np.interp(bearing, angles, usual) - np.hypot(*clusters.centre.T) > NEARER_MARGIN_M
         still = fixed(clusters.centre)
-        person = nearer & ~still & (clusters.width < WIDEST) & (clusters.count * step >= 4)
+        person = nearer & ~still & (clusters.width < MAX_CLUSTER_WIDTH_M) & (clusters.count * step >= 4)
         yield _select_examples(scan, person, person | (still & ~nearer))
 
 
 def _select_examples(scan: Scan, legs: NDArray[np.bool_], kept: NDArray[np.bool_]) -> Examples:
     """Describe the objects of a scan, and select some."""
-    return Examples(describe(scan, find_clusters(scan))[kept], legs[kept])
+    return Examples(cluster_features(scan, find_clusters(scan))[kept], legs[kept])
 
 
 class _FixedObjects:
@@ -131,7 +133,7 @@ class _FixedObjects:
 
     def __init__(self, content: dict[str, Any]) -> None:
         scans = [
-            Scan.checked(ranges, float(content["angle_min"]), float(content["angle_increment"]))
+            Scan.validated(ranges, float(content["angle_min"]), float(content["angle_increment"]))
             for ranges in content["ranges"].astype(float)
         ]
         self._seen = [find_clusters(scan).centre for scan in scans[:: max(1, len(scans) // 100)]]
@@ -168,15 +170,15 @@ def _scene(rng: np.random.Generator) -> Iterator[Examples]:
     for _ in range(10):
         for walker in people:
             walker.step(rng.uniform(0.05, 0.4))
-        legs = circles(people)
+        legs = leg_circles(people)
         pose = np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(-np.pi, np.pi)])
-        scan = Scan.checked(
+        scan = Scan.validated(
             laser.scan(place.with_circles(legs), pose, rng), laser.angle_min, laser.angle_increment
         )
         clusters = find_clusters(scan)
         named = _nearest(to_frame(clusters.centre, pose), legs[:, :2]) < LABEL_RADIUS_M
-        named &= clusters.width < WIDEST
-        unclear = _nearest(to_frame(clusters.centre, pose), legs[:, :2]) < WIDEST
+        named &= clusters.width < MAX_CLUSTER_WIDTH_M
+        unclear = _nearest(to_frame(clusters.centre, pose), legs[:, :2]) < MAX_CLUSTER_WIDTH_M
         yield _select_examples(scan, named, named | ~unclear)
 
 

@@ -55,7 +55,7 @@ def _signs(*signs: float) -> Mirror:
 
 
 _PLANAR = _signs(1, -1, -1)
-MIRROR = symmetry.stack(
+MIRROR = symmetry.concatenate_mirrors(
     [
         symmetry.OBSERVATION,
         symmetry.FEET,  # contact

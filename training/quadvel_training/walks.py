@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from quadvel_description import robot
-from quadvel_description.command_range import held
+from quadvel_description.command_range import clip_to_command_range
 from quadvel_description.state import RobotState
 from quadvel_policy.observation import DEFAULT_OBSERVATION, build_observation
 from quadvel_policy.supervisor import SupervisorConfig
@@ -96,7 +96,7 @@ class Modes:
     @property
     def previous_action(self) -> np.ndarray:
         """Targets minus the nominal posture (n, 12), rad; zeros while damping."""
-        return np.where((self.mode == Mode.DAMPING)[:, None], 0.0, held(self.target) - UP)
+        return np.where((self.mode == Mode.DAMPING)[:, None], 0.0, clip_to_command_range(self.target) - UP)
 
     def begin(self, ids: np.ndarray) -> np.ndarray:
         """Draw a first mode for some robots.

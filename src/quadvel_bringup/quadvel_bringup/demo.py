@@ -21,7 +21,7 @@ from quadvel_eval.output import output_folder, replacing
 from quadvel_eval.recording import Recording, read_recording
 from quadvel_eval.report import segment_table, write_figure, write_json
 from quadvel_nodes.number_text import number_text
-from quadvel_sim.world import SHIPPED
+from quadvel_sim.world import SHIPPED_WORLDS
 
 from .doctor import GL_PACKAGES, gl_backend, video_encoder
 from .follow_demo import follow
@@ -81,7 +81,9 @@ def demo_command(
     view: Annotated[bool, typer.Option("--view", help="Serve the operator page in the browser.")] = False,
     world: Annotated[
         str,
-        typer.Option(metavar="<name|file>", help=f"With follow: world, {', '.join(SHIPPED)} or a YAML file."),
+        typer.Option(
+            metavar="<name|file>", help=f"With follow: world, {', '.join(SHIPPED_WORLDS)} or a YAML file."
+        ),
     ] = "campus",
     seconds: Annotated[float, typer.Option(min=5.0, help="With follow: duration, s.")] = 180.0,
     tour: Annotated[

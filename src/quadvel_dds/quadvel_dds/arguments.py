@@ -1,4 +1,4 @@
-"""Command-line arguments of a ROS 2 process: parameters, parameter files, remappings, log levels."""
+"""ROS arguments of a command line: parameters, parameter files, remappings, log levels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import attrs
 import yaml
 
-from quadvel_description.bounded_yaml import BoundedLoader, bounded_text, load_yaml
+from quadvel_description.bounded_yaml import BoundedLoader, load_yaml, read_bounded_text
 
 SCOPE_KEY = "ros__parameters"
 FLAGS = {
@@ -21,12 +21,18 @@ IGNORED_FLAGS = {f"--{on}-{what}" for on in ("enable", "disable") for what in ("
 
 
 class InvalidROSArgsError(ValueError):
-    """What follows --ros-args is not understood."""
+    """The arguments after --ros-args are invalid."""
 
 
 @attrs.frozen
 class Rule:
-    """One `[node:]from:=to` or `[node:]parameter:=value`."""
+    """A rule `[node:]from:=to` or `[node:]parameter:=value`.
+
+    Attributes:
+        node: Name of the node that the rule applies to; None: all nodes.
+        name: Name that is replaced or set.
+        value: New name or value.
+    """
 
     node: str | None
     name: str
@@ -35,9 +41,12 @@ class Rule:
 
 @attrs.frozen
 class ParameterOverride:
-    """A value for the parameter `name` of the nodes whose full name matches `pattern`.
+    """Value of a parameter for the nodes whose full names match a pattern.
 
-    In a pattern * is one token of the name, ** any number of them.
+    Attributes:
+        pattern: Full node name; `*` matches one token, `/**` any number of tokens.
+        name: Name of the parameter.
+        value: Value of the parameter.
     """
 
     pattern: str
@@ -45,6 +54,14 @@ class ParameterOverride:
     value: Any
 
     def applies_to(self, full_name: str) -> bool:
+        """Return whether the override applies to a node.
+
+        Args:
+            full_name: Full name of the node, such as `/ns/name`.
+
+        Returns:
+            Whether the pattern matches.
+        """
         meaning = {"/**": "(/[^/]+)*", "*": "[^/]+"}
         parts = re.split(r"(/\*\*|\*)", self.pattern)
         return (
@@ -54,19 +71,39 @@ class ParameterOverride:
 
 @attrs.define
 class RosArguments:
-    """What was found between --ros-args and -- (or the end)."""
+    """Arguments between --ros-args and -- (or the end).
+
+    Attributes:
+        remappings: Remapping rules.
+        overrides: Parameter overrides.
+        log_levels: Log level by logger name; the name "" is the default.
+    """
 
     remappings: list[Rule] = attrs.field(factory=list)
     overrides: list[ParameterOverride] = attrs.field(factory=list)
-    log_levels: dict[str, str] = attrs.field(factory=dict)  # logger name ("" = default) to level
+    log_levels: dict[str, str] = attrs.field(factory=dict)
 
     def parameters_for(self, full_name: str) -> dict[str, Any]:
-        """Overrides of a node ("/ns/name"), later ones first in rank."""
+        """Return the parameter overrides of a node; a later override replaces an earlier one.
+
+        Args:
+            full_name: Full name of the node, such as `/ns/name`.
+
+        Returns:
+            Values by parameter name.
+        """
         return {o.name: o.value for o in self.overrides if o.applies_to(full_name)}
 
 
 def parse(args: Sequence[str]) -> RosArguments:
-    """Read a command line. Raises InvalidROSArgsError that names what is at fault."""
+    """Parse a command line.
+
+    Args:
+        args: Command line; arguments outside --ros-args are ignored.
+
+    Returns:
+        The ROS arguments. InvalidROSArgsError propagates; it names the wrong argument.
+    """
     found = RosArguments()
     within = False
     arguments = iter(args)
@@ -81,6 +118,7 @@ def parse(args: Sequence[str]) -> RosArguments:
 
 
 def _parse_one(flag: str, following: Iterator[str], found: RosArguments) -> None:
+    """Parse one flag with its value."""
     if flag not in FLAGS:
         raise InvalidROSArgsError(f"ROS argument '{flag}' is not known, or not offered here")
     value = next(following, None)
@@ -101,6 +139,18 @@ def _parse_one(flag: str, following: Iterator[str], found: RosArguments) -> None
 
 
 def parse_rule(flag: str, text: str) -> Rule:
+    """Parse a rule.
+
+    Args:
+        flag: Flag in front of the rule, for the error message.
+        text: The rule.
+
+    Returns:
+        The rule.
+
+    Raises:
+        InvalidROSArgsError: The text is no rule.
+    """
     left, separator, right = text.partition(":=")
     node, _, name = left.rpartition(":")
     if not separator or not name or re.match(r"ros(topic|service)://", left):
@@ -109,7 +159,7 @@ def parse_rule(flag: str, text: str) -> Rule:
 
 
 class _Loader(BoundedLoader):
-    """YAML as ROS 2 reads it: 1e-3 is a number, a date is not, and there are no aliases."""
+    """YAML loader with ROS 2's rules: 1e-3 is a number, dates are text, aliases are refused."""
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
@@ -127,11 +177,20 @@ _Loader.add_implicit_resolver(
 
 
 def parse_value(where: str, text: str) -> Any:
-    """A parameter value from YAML text. Raises InvalidROSArgsError."""
+    """Parse a parameter value.
+
+    Args:
+        where: Place of the value, for the error message.
+        text: YAML text.
+
+    Returns:
+        The value. InvalidROSArgsError propagates.
+    """
     return check_value(where, _load(where, text) if text else "")
 
 
 def _load(where: str, text: str) -> Any:
+    """Return the document of a YAML text."""
     try:
         return load_yaml(text, _Loader)
     except ValueError as error:
@@ -139,7 +198,18 @@ def _load(where: str, text: str) -> Any:
 
 
 def check_value(where: str, value: Any) -> Any:
-    """The value, if a parameter can hold it: a bool, int, float, string or a list of one of these."""
+    """Check that a parameter can hold a value.
+
+    Args:
+        where: Place of the value, for the error message.
+        value: The value.
+
+    Returns:
+        The value.
+
+    Raises:
+        InvalidROSArgsError: It is no bool, int, float, string or list of one of these.
+    """
     types = {type(item) for item in value} if isinstance(value, list) else {type(value)}
     if len(types) > 1 or not types <= {bool, int, float, str}:
         raise InvalidROSArgsError(
@@ -149,10 +219,20 @@ def check_value(where: str, value: Any) -> Any:
 
 
 def read_parameter_file(path: Path) -> list[ParameterOverride]:
-    """Overrides of a YAML file. Raises InvalidROSArgsError that names the file and the key at fault."""
+    """Read the parameter overrides of a YAML file.
+
+    Args:
+        path: Path of the file.
+
+    Returns:
+        The overrides.
+
+    Raises:
+        InvalidROSArgsError: The file is unreadable or malformed; the message names file and key.
+    """
     where = f"parameter file '{path}'"
     try:
-        document = _load(where, bounded_text(path))
+        document = _load(where, read_bounded_text(path))
     except (OSError, UnicodeDecodeError) as error:
         fault = f"cannot be read: {error.strerror}" if isinstance(error, OSError) else "is not text"
         raise InvalidROSArgsError(f"{where} {fault}") from error
@@ -160,6 +240,7 @@ def read_parameter_file(path: Path) -> list[ParameterOverride]:
 
 
 def _walk_nodes(where: str, prefix: str, tree: Any) -> Iterable[ParameterOverride]:
+    """Yield the overrides of a tree of node names."""
     if not isinstance(tree, dict):
         below = f" under '{prefix}'" if prefix else ""
         raise InvalidROSArgsError(
@@ -176,6 +257,7 @@ def _walk_nodes(where: str, prefix: str, tree: Any) -> Iterable[ParameterOverrid
 
 
 def _flatten(prefix: str, branch: dict[Any, Any]) -> Iterable[tuple[str, Any]]:
+    """Yield the parameters of nested mappings with dotted names."""
     for key, value in branch.items():
         if isinstance(value, dict):
             yield from _flatten(f"{prefix}{key}.", value)

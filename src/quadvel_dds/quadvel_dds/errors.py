@@ -1,4 +1,4 @@
-"""The error that says what the embedded middleware does not offer, and what raises it."""
+"""Errors for the parts of rclpy that the embedded middleware does not support."""
 
 from __future__ import annotations
 
@@ -8,24 +8,29 @@ from typing import Any, NoReturn
 
 
 class UnsupportedError(NotImplementedError):
-    """A part of rclpy that the embedded middleware does not offer."""
+    """A part of rclpy that the embedded middleware does not support."""
 
     def __init__(self, what: str) -> None:
+        """Create the error.
+
+        Args:
+            what: The unsupported part.
+        """
         super().__init__(
             f"{what} is not offered by quadvel's embedded middleware (quadvel_dds); use ROS 2 for it"
         )
 
 
 class UnsupportedModuleError(UnsupportedError, ImportError):
-    """A module of rclpy that is not offered; an ImportError, for those who look whether it is there."""
+    """An unsupported module of rclpy; an ImportError, so that optional imports work."""
 
 
 class UnsupportedMemberError(UnsupportedError, AttributeError):
-    """A method or property that is not offered; an AttributeError, for those who look whether it is there."""
+    """An unsupported method or property; an AttributeError, so that `hasattr` works."""
 
 
 class Partial:
-    """Base of what has a part of the members of rclpy's class: any other public one raises UnsupportedError."""
+    """Base of classes with some members of rclpy's class; others raise UnsupportedError."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
@@ -34,7 +39,14 @@ class Partial:
 
 
 def unsupported(what: str) -> Callable[..., NoReturn]:
-    """A function that raises UnsupportedError however it is called."""
+    """Create a function that always raises UnsupportedError.
+
+    Args:
+        what: The unsupported part.
+
+    Returns:
+        The function.
+    """
 
     def refuse(*args: Any, **kwargs: Any) -> NoReturn:
         raise UnsupportedError(what)
@@ -43,14 +55,30 @@ def unsupported(what: str) -> Callable[..., NoReturn]:
 
 
 def refuse_options(where: str, **options: Any) -> None:
-    """Raise UnsupportedError if any of the options is set."""
+    """Refuse unsupported options.
+
+    Args:
+        where: Function that has the options.
+        **options: Values of the options.
+
+    Raises:
+        UnsupportedError: An option is set.
+    """
     for name, value in options.items():
         if value:
             raise UnsupportedError(f"{where}: option '{name}'")
 
 
 def module_getattr(module: str, folder: Path | None = None) -> Callable[[str], NoReturn]:
-    """`__getattr__` of a module (of a package, with its `folder`): a public name not there is unsupported."""
+    """Create the `__getattr__` of a module whose missing public names are unsupported.
+
+    Args:
+        module: Name of the module.
+        folder: Folder of a package, whose submodules are no missing names.
+
+    Returns:
+        The function.
+    """
 
     def getattr_(name: str) -> NoReturn:
         is_submodule = folder is not None and (folder / f"{name}.py").exists()

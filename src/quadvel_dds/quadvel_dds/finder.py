@@ -1,4 +1,4 @@
-"""Import of `rclpy` and of message packages from the embedded middleware, where ROS 2 is not importable."""
+"""Import hooks for `rclpy` and message packages of the embedded middleware."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from importlib.util import find_spec, spec_from_loader
 from pathlib import Path
 from types import ModuleType
 
+from typing_extensions import override
+
 from quadvel_dds.errors import UnsupportedModuleError
 
 EMBEDDED = str(Path(__file__).parent)
 
 
 class InterfaceLoader(Loader):
-    """Makes the modules `PKG`, `PKG.msg` and `PKG.srv`; classes are made when they are first asked for."""
+    """Creates the modules `PKG`, `PKG.msg` and `PKG.srv`; classes follow at their first use."""
 
+    @override
     def exec_module(self, module: ModuleType) -> None:
         from quadvel_dds import messages
 
@@ -40,8 +43,9 @@ class InterfaceLoader(Loader):
 
 
 class EmbeddedFinder(MetaPathFinder):
-    """Finds `rclpy` beside this file, and message packages in the definitions."""
+    """Finds `rclpy` next to this file, and message packages in the definitions."""
 
+    @override
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
@@ -64,12 +68,20 @@ class EmbeddedFinder(MetaPathFinder):
 
 
 def is_installed() -> bool:
-    """Whether `rclpy` resolves to the embedded middleware in this process."""
+    """Return whether `rclpy` resolves to the embedded middleware in this process.
+
+    Returns:
+        Whether the import hook is installed.
+    """
     return any(isinstance(finder, EmbeddedFinder) for finder in sys.meta_path)
 
 
 def ros2_fault() -> str | None:
-    """Why the rclpy that is importable here, if any, is none to run on: one sentence. None where nothing is wrong."""
+    """Return the reason why the installed rclpy is unusable.
+
+    Returns:
+        One sentence; None if it is usable or there is none.
+    """
     if find_spec("rclpy") is None or is_installed():
         return None
     interfaces = find_spec("quadvel_msgs")
@@ -82,11 +94,17 @@ def ros2_fault() -> str | None:
 
 
 def install() -> bool:
-    """Make `rclpy` and the message packages resolve to the embedded middleware; returns whether they do.
+    """Make `rclpy` and the message packages resolve to the embedded middleware.
 
-    Where ROS 2's own rclpy is importable nothing is done, unless QUADVEL_MIDDLEWARE=embedded. Without our interfaces
-    that rclpy is none to run on: this is said on stderr once, and this process and its children run embedded. Raises
-    RuntimeError if that rclpy is imported already.
+    Does nothing if ROS 2's rclpy is importable and usable, unless QUADVEL_MIDDLEWARE=embedded. An
+    rclpy without quadvel_msgs is unusable: this is reported on stderr once, and this process and
+    its children use the embedded middleware.
+
+    Returns:
+        Whether the embedded middleware is used.
+
+    Raises:
+        RuntimeError: ROS 2's rclpy is imported already.
     """
     if is_installed():
         return True

@@ -1,7 +1,7 @@
-"""Our messages as types of Cyclone DDS.
+"""Cyclone DDS types of the messages.
 
-Cyclone checks incoming samples against the types, so that malformed data never arrives. The content passes through it
-as bytes, which `messages` writes and reads.
+Cyclone checks received samples against these types, so malformed data are dropped. The content
+passes as CDR bytes, which `messages` writes and reads.
 """
 
 from __future__ import annotations
@@ -22,9 +22,15 @@ REQUEST_HEADER = {"client_guid_": types.uint64, "sequence_number_": types.int64}
 
 @cache
 def struct(typename: str) -> Any:
-    """Type of a message; of a service's half, with the header of rmw_cyclonedds in front.
+    """Create the Cyclone type of a message, or of a service request or response.
 
-    Its samples are made of CDR bytes, and hold them as `data`.
+    The latter start with the request header of rmw_cyclonedds.
+
+    Args:
+        typename: Full name, such as `geometry_msgs/msg/Twist`.
+
+    Returns:
+        Type whose samples hold CDR bytes as `data`.
     """
     fields = {f"{name}_": _field(description) for name, description in messages.STORE.fielddefs[typename][1]}
     if "/srv/" in typename:
@@ -37,6 +43,7 @@ def struct(typename: str) -> Any:
 
 
 def _field(description: Any) -> type[IdlStruct] | Any:
+    """Return the Cyclone type of a field."""
     kind, detail = description
     if kind == Nodetype.NAME:
         return struct(detail)

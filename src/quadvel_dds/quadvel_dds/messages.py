@@ -1,8 +1,8 @@
-"""Message and service classes that look and behave like those which ROS 2 generates for Python.
+"""Message and service classes with the interface of those that ROS 2 generates for Python.
 
-Definitions and their bytes are those of `rosbags`; a class is made when it is first asked for. As in ROS 2, fields are
-not checked on assignment. A value that cannot be sent raises ValueError when it is published, where ROS 2 would cut it
-off or read past its end.
+Definitions and serialization come from `rosbags`; a class is created at its first use. As in ROS 2,
+fields are not checked on assignment. A value that cannot be sent raises ValueError when it is
+published, where ROS 2 truncates it or reads past its end.
 """
 
 from __future__ import annotations
@@ -31,11 +31,27 @@ STORE.register(definitions.STORE.fielddefs)
 
 
 def is_interface_package(package: str) -> bool:
+    """Return whether a package has message definitions.
+
+    Args:
+        package: Name of the package.
+
+    Returns:
+        Whether a definition of it is known.
+    """
     return any(name.startswith(f"{package}/") for name in STORE.fielddefs)
 
 
 def names_in(package: str, kind: str) -> list[str]:
-    """Names of a package's messages ("msg"), or of its services with their requests and responses ("srv")."""
+    """List the definitions of a package.
+
+    Args:
+        package: Name of the package.
+        kind: `msg`, or `srv` for services with their requests and responses.
+
+    Returns:
+        Sorted names.
+    """
     prefix = f"{package}/{kind}/"
     names = {name.removeprefix(prefix) for name in STORE.fielddefs if name.startswith(prefix)}
     return sorted(names | {name.removesuffix("_Request") for name in names})
@@ -61,29 +77,55 @@ class Message:
 
 
 class Octet(bytes):
-    """A field of type byte: one byte for those who use it, a number for rosbags."""
+    """Value of a field of type byte: bytes of length 1 for users, a number for rosbags."""
 
     def __index__(self) -> int:
         return int.from_bytes(self, signed=True)
 
 
 class Numbers(array.array):  # type: ignore[type-arg]
-    """A sequence of numbers: an array.array as in ROS 2, with what rosbags asks of a NumPy array."""
+    """Sequence of numbers: an array.array as in ROS 2, with `view` of a NumPy array for rosbags."""
 
     def view(self, dtype: Any) -> Any:
+        """Return the bytes as a NumPy array.
+
+        Args:
+            dtype: Type of the elements.
+
+        Returns:
+            The array.
+        """
         return np.frombuffer(self.tobytes(), dtype)
 
 
 class Flags(list):  # type: ignore[type-arg]
-    """An array or a sequence of bools or bytes: a list as in ROS 2, with what rosbags asks of a NumPy array."""
+    """Array or sequence of bools or bytes: a list as in ROS 2, with the `view` of a NumPy array."""
 
     def view(self, dtype: Any) -> Any:
+        """Return the bytes as a NumPy array.
+
+        Args:
+            dtype: Type of the elements.
+
+        Returns:
+            The array.
+        """
         return np.frombuffer(b"".join(bytes([v]) if isinstance(v, bool) else v for v in self), dtype)
 
 
 @cache
 def message_class(typename: str) -> type[Message]:
-    """The class of a message, a request or a response, by its full name ("geometry_msgs/msg/Twist")."""
+    """Create the class of a message, request or response.
+
+    Args:
+        typename: Full name, such as `geometry_msgs/msg/Twist`.
+
+    Returns:
+        The class.
+
+    Raises:
+        KeyError: The type is unknown.
+    """
     if typename not in STORE.fielddefs:
         raise KeyError(f"message type '{typename}' is not known to quadvel_dds")
     constants, fields = STORE.fielddefs[typename]
@@ -106,17 +148,31 @@ def message_class(typename: str) -> type[Message]:
 
 @cache
 def service_class(typename: str) -> type:
-    """The class of a service by its full name ("std_srvs/srv/Trigger"), with `Request` and `Response`."""
+    """Create the class of a service, with `Request` and `Response`.
+
+    Args:
+        typename: Full name, such as `std_srvs/srv/Trigger`.
+
+    Returns:
+        The class.
+    """
     package, kind, name = typename.split("/")
     parts = {part: message_class(f"{typename}_{part}") for part in ("Request", "Response")}
     return type(name, (), {"__module__": f"{package}.{kind}", "TYPENAME": typename, **parts})
 
 
 def serialize(message: Message, prefix: bytes = b"") -> bytearray:
-    """CDR bytes of a message, encapsulation header included, padded to a multiple of four.
+    """Serialize a message to CDR.
 
-    `prefix` goes in front of the content: the header of a service call, a multiple of eight bytes. Raises ValueError
-    that says why.
+    Args:
+        message: The message.
+        prefix: Bytes before the content, a multiple of eight: the header of a service call.
+
+    Returns:
+        CDR bytes with encapsulation header, padded to a multiple of four.
+
+    Raises:
+        ValueError: A field cannot be sent; the message names it.
     """
     try:
         content = STORE.serialize_cdr(message, message.TYPENAME, little_endian=True)[4:]
@@ -129,7 +185,19 @@ def serialize(message: Message, prefix: bytes = b"") -> bytearray:
 
 
 def deserialize(data: bytes, typename: str, prefix_size: int = 0) -> Any:
-    """Message from its CDR bytes. Raises ValueError where they do not hold one."""
+    """Deserialize a message from CDR.
+
+    Args:
+        data: CDR bytes with encapsulation header.
+        typename: Full name of the type.
+        prefix_size: Number of bytes before the content.
+
+    Returns:
+        The message.
+
+    Raises:
+        ValueError: The bytes do not hold such a message.
+    """
     if data[:2] != HEADER[:2]:
         raise ValueError(
             f"{typename}: encapsulation {data[:2].hex()} found, expected 0001 (little-endian CDR)"
@@ -144,17 +212,32 @@ def deserialize(data: bytes, typename: str, prefix_size: int = 0) -> Any:
 
 @cache
 def type_hash(typename: str) -> str:
+    """Compute the type hash (RIHS01) that ROS 2 publishes in discovery.
+
+    Args:
+        typename: Full name of the type.
+
+    Returns:
+        The hash.
+    """
     return str(STORE.hash_rihs01(typename))
 
 
 def dds_name(typename: str) -> str:
-    """Name of the type on the wire: "geometry_msgs::msg::dds_::Twist_"."""
+    """Return the name of a type on the wire.
+
+    Args:
+        typename: Full name of the type.
+
+    Returns:
+        Name such as `geometry_msgs::msg::dds_::Twist_`.
+    """
     package, kind, name = typename.split("/")
     return f"{package}::{kind}::dds_::{name}_"
 
 
 def _accessor(slot: Any, convert: Callable[[Any], Any] | None) -> Any:
-    """How a field is read and assigned: plainly, or converted."""
+    """Return the descriptor of a field: its slot, or a property that converts on assignment."""
     if convert is None:
         return slot
     store = slot.__set__
@@ -162,7 +245,7 @@ def _accessor(slot: Any, convert: Callable[[Any], Any] | None) -> Any:
 
 
 def _converter(description: Description) -> Callable[[Any], Any] | None:
-    """What makes of an assigned value what is kept; None where it is kept as it is."""
+    """Return the conversion of an assigned value; None if there is none."""
     kind, detail = description
     if kind == Nodetype.NAME:
         return None
@@ -189,7 +272,7 @@ def _converter(description: Description) -> Callable[[Any], Any] | None:
 
 
 def _from_bytes(description: Description) -> Callable[[Any], Any] | None:
-    """What makes of a value that rosbags read what is kept; None where it is kept as it is."""
+    """Return the conversion of a value that rosbags has read; None if there is none."""
     kind, detail = description
     if kind == Nodetype.BASE:
         return (lambda value: Octet([value % 256])) if detail[0] == "byte" else None
@@ -205,7 +288,7 @@ def _from_bytes(description: Description) -> Callable[[Any], Any] | None:
 
 
 def _make_reader(cls: type, fields: Any) -> Callable[..., Any]:
-    """Function that makes a message of the values of its fields as rosbags read them."""
+    """Return a function that creates a message from field values that rosbags has read."""
     conversions = [(f"_{field}", _from_bytes(description)) for field, description in fields]
     names: dict[str, Any] = {"new": object.__new__, "cls": cls}
     lines = [f"def read({', '.join(slot for slot, _ in conversions)}):", "    m = new(cls)"]
@@ -217,7 +300,7 @@ def _make_reader(cls: type, fields: Any) -> Callable[..., Any]:
 
 
 def _default(typename: str, field: str, description: Description) -> Callable[[], Any]:
-    """Function that makes the default value of a field."""
+    """Return a function that creates the default value of a field."""
     kind, detail = description
     if kind == Nodetype.NAME:
         return message_class(detail)
@@ -231,7 +314,7 @@ def _default(typename: str, field: str, description: Description) -> Callable[[]
 
 
 def _make_init(typename: str, fields: Any) -> Callable[..., None]:
-    """`__init__` with one keyword argument a field; what is not given gets its default."""
+    """Return `__init__` with one keyword argument per field; omitted fields get their defaults."""
     names: dict[str, Any] = {}
     lines = [f"def __init__(self, *, {', '.join(f'{field}=None' for field, _ in fields)}):"]
     for field, description in fields:
@@ -245,7 +328,14 @@ def _make_init(typename: str, fields: Any) -> Callable[..., None]:
 
 
 def fault(message: Message) -> str | None:
-    """The first field, nested ones included, that cannot be sent, in a sentence; None if all can."""
+    """Find the first field that cannot be sent, nested fields included.
+
+    Args:
+        message: The message.
+
+    Returns:
+        A sentence that names it; None if all fields can be sent.
+    """
     for field, _ in STORE.fielddefs[message.TYPENAME][1]:
         value = getattr(message, f"_{field}")
         if isinstance(value, Message) and (inner := fault(value)):

@@ -16,7 +16,15 @@ TOPIC = re.compile(
 
 
 def fault(pattern: re.Pattern[str], name: str) -> tuple[str, int] | None:
-    """What is wrong with a name and where, or None."""
+    """Validate a name.
+
+    Args:
+        pattern: Pattern of valid names: NODE, ABSOLUTE or TOPIC.
+        name: The name.
+
+    Returns:
+        Reason and position of the error, or None.
+    """
     if pattern.fullmatch(name):
         return None
     if not name:
@@ -26,7 +34,16 @@ def fault(pattern: re.Pattern[str], name: str) -> tuple[str, int] | None:
 
 
 def expand(name: str, node: str, namespace: str) -> str:
-    """Full name of a topic or service as seen by a node: absolute, relative, or private (~)."""
+    """Expand an absolute, relative or private (~) name of a topic or service.
+
+    Args:
+        name: The name.
+        node: Name of the node that uses it.
+        namespace: Namespace of that node.
+
+    Returns:
+        Full name.
+    """
     for key, value in {"{node}": node, "{ns}": namespace, "{namespace}": namespace}.items():
         name = name.replace(key, value)
     base = namespace.rstrip("/")
@@ -36,7 +53,17 @@ def expand(name: str, node: str, namespace: str) -> str:
 
 
 def remap(full_name: str, node: str, namespace: str, rules: Iterable[Rule]) -> str:
-    """The name after the first rule that fits, both sides of which are expanded as names of this node."""
+    """Apply the first matching remapping rule.
+
+    Args:
+        full_name: Full name of a topic or service.
+        node: Name of the node that uses it.
+        namespace: Namespace of that node.
+        rules: Remapping rules; both sides are expanded as names of this node.
+
+    Returns:
+        Full name after remapping.
+    """
     for rule in rules:
         applies = rule.node in (None, node) and not rule.name.startswith("__")
         if applies and expand(rule.name, node, namespace) == full_name:
@@ -45,7 +72,16 @@ def remap(full_name: str, node: str, namespace: str, rules: Iterable[Rule]) -> s
 
 
 def remap_node(node: str, namespace: str, rules: Iterable[Rule]) -> tuple[str, str]:
-    """Name and namespace of a node after `__node:=` (or `__name:=`) and `__ns:=`."""
+    """Apply `__node:=` (or `__name:=`) and `__ns:=`.
+
+    Args:
+        node: Name of a node.
+        namespace: Namespace of the node.
+        rules: Remapping rules.
+
+    Returns:
+        Name and namespace after remapping.
+    """
     for rule in rules:
         if rule.node in (None, node):
             if rule.name in ("__node", "__name"):
@@ -56,5 +92,12 @@ def remap_node(node: str, namespace: str, rules: Iterable[Rule]) -> tuple[str, s
 
 
 def ros_type(dds_type: str) -> str:
-    """`pkg/msg/Name` of the type `pkg::msg::dds_::Name_` on the wire."""
+    """Convert the name of a type on the wire.
+
+    Args:
+        dds_type: Name such as `pkg::msg::dds_::Name_`.
+
+    Returns:
+        Name such as `pkg/msg/Name`.
+    """
     return dds_type.replace("::dds_::", "/").replace("::", "/").rstrip("_")

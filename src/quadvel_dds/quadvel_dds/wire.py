@@ -1,9 +1,10 @@
 """DDS as ROS 2 uses it: names, types, QoS and user data on the wire, over Cyclone DDS.
 
-Topics are `rt/NAME` with type `PKG::msg::dds_::NAME_`; services are the pair `rq/NAMERequest`,
-`rr/NAMEReply`, each sample led by the request header of rmw_cyclonedds (a 64-bit client id and a 64-bit
-sequence number). rmw_fastrtps matches replies by the RTPS sample identity instead, so topics work with both,
-service calls with rmw_cyclonedds alone: it is known by its user data, and calls of others are left alone.
+Topics are `rt/NAME` with type `PKG::msg::dds_::NAME_`. A service is the pair `rq/NAMERequest`,
+`rr/NAMEReply`; each sample starts with the request header of rmw_cyclonedds: a 64-bit client id and
+a 64-bit sequence number. rmw_fastrtps matches replies by the RTPS sample identity instead. Topics
+therefore work with both, service calls with rmw_cyclonedds only. Its endpoints are recognized by
+their user data; calls of others are ignored.
 """
 
 from __future__ import annotations
@@ -30,18 +31,30 @@ from quadvel_dds import idl, messages
 ANY = core.SampleState.Any | core.ViewState.Any | InstanceState.Any
 REQUEST_HEADER = struct.Struct("<Qq")
 MAX_PARTICIPANTS = 32  # on one host, as rmw_cyclonedds sets it
-# Cyclone drops what nodes elsewhere say of themselves, and ROS 2 looks for nodes of its host on this one.
+# Cyclone drops discovery data of other hosts on this interface; ROS 2 finds local nodes on it.
 LOOPBACK = '<General><Interfaces><NetworkInterface name="lo"/></Interfaces><AllowMulticast>false</AllowMulticast></General>'
-# How often participants introduce themselves: ROS 2 may start later, and it calls over multicast, which is not heard here.
-ANNOUNCEMENT = "2 s"
-REACHES = ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT", "OFF")
+# Period of discovery messages: ROS 2 may start later, and its multicast is not received here.
+ANNOUNCEMENT_PERIOD = "2 s"
+DISCOVERY_RANGES = ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT", "OFF")
 
 
 def domain_configuration() -> str:
-    """Cyclone's settings for ROS_AUTOMATIC_DISCOVERY_RANGE (default here: LOCALHOST) and ROS_STATIC_PEERS."""
+    """Create Cyclone's configuration from the ROS environment variables.
+
+    These are ROS_AUTOMATIC_DISCOVERY_RANGE (default here: LOCALHOST), ROS_STATIC_PEERS and
+    CYCLONEDDS_URI.
+
+    Returns:
+        Configuration for Cyclone DDS.
+
+    Raises:
+        ValueError: ROS_AUTOMATIC_DISCOVERY_RANGE has an unknown value.
+    """
     reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "LOCALHOST"
-    if reach not in REACHES:
-        raise ValueError(f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}', expected {', '.join(REACHES)}")
+    if reach not in DISCOVERY_RANGES:
+        raise ValueError(
+            f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}', expected {', '.join(DISCOVERY_RANGES)}"
+        )
     discovery, general = "", LOOPBACK if reach in ("LOCALHOST", "OFF") else ""
     if reach == "OFF":
         discovery = f"<ParticipantIndex>none</ParticipantIndex><Tag>ros_discovery_off_{os.getpid()}</Tag>"
@@ -51,7 +64,7 @@ def domain_configuration() -> str:
         addresses = "".join(f'<Peer address="{peer}" pruneDelay="inf"/>' for peer in peers)
         discovery = (
             f"<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex>"
-            f"<SPDPInterval>{ANNOUNCEMENT}</SPDPInterval><Peers>{addresses}</Peers>"
+            f"<SPDPInterval>{ANNOUNCEMENT_PERIOD}</SPDPInterval><Peers>{addresses}</Peers>"
         )
     own = f"<CycloneDDS><Domain>{general}<Discovery>{discovery}</Discovery></Domain></CycloneDDS>"
     return ",".join(filter(None, [own, os.environ.get("CYCLONEDDS_URI")]))
@@ -59,7 +72,11 @@ def domain_configuration() -> str:
 
 @cache
 def _join(domain_id: int) -> Domain:
-    """The domain. Without settings of the user's own its sockets, open to all in Cyclone, hear the loopback interface alone."""
+    """Join a domain.
+
+    Without a CYCLONEDDS_URI the sockets, which Cyclone binds to all interfaces, are bound to the
+    loopback interface.
+    """
     settings, before = domain_configuration(), _sockets()
     domain = Domain(domain_id, settings)
     if LOOPBACK in settings and not os.environ.get("CYCLONEDDS_URI"):
@@ -70,20 +87,34 @@ def _join(domain_id: int) -> Domain:
 
 
 def _sockets() -> dict[str, int]:
-    """The descriptors of this process's sockets, by names that no two have."""
+    """Return the descriptors of this process's sockets by unique names."""
     files = {os.path.realpath(f"/proc/self/fd/{one}"): int(one) for one in os.listdir("/proc/self/fd")}
     return {name: descriptor for name, descriptor in files.items() if "/socket:" in name}
 
 
 def delete(entity: core.Entity) -> None:
-    """Delete a DDS entity now. Cyclone offers this in its finaliser alone; a second call is harmless."""
+    """Delete a DDS entity immediately; a second call is harmless.
+
+    Args:
+        entity: The entity. Cyclone's Python layer offers this in its finalizer only.
+    """
     entity.__del__()
 
 
 class Participant:
-    """One process on the domain: makes readers and writers and tells who else is there."""
+    """Membership of the process in a domain: creates readers and writers, lists endpoints.
+
+    Attributes:
+        dds: Cyclone's participant.
+        gid: Its identity on the wire.
+    """
 
     def __init__(self, domain_id: int) -> None:
+        """Join a domain.
+
+        Args:
+            domain_id: Number of the domain, 0 to 232.
+        """
         _join(domain_id)
         self.dds = DomainParticipant(domain_id, qos=Qos(Policy.Userdata(b"enclave=/;")))
         self.gid = self.dds.guid.bytes
@@ -97,19 +128,49 @@ class Participant:
         self._endpoints: dict[str, list[Any]] = {}
 
     def writer(self, topic: str, typename: str, profile: Any, user_data: str = "") -> Writer:
+        """Create a writer.
+
+        Args:
+            topic: Name of the DDS topic.
+            typename: Full name of the type.
+            profile: QoS profile.
+            user_data: User data of the endpoint.
+
+        Returns:
+            The writer.
+        """
         return Writer(DataWriter(self.dds, *self._as_dds(topic, typename, profile, user_data)))
 
     def reader(self, topic: str, typename: str, profile: Any, user_data: str = "") -> Reader:
+        """Create a reader.
+
+        Args:
+            topic: Name of the DDS topic.
+            typename: Full name of the type.
+            profile: QoS profile.
+            user_data: User data of the endpoint.
+
+        Returns:
+            The reader.
+        """
         return Reader(DataReader(self.dds, *self._as_dds(topic, typename, profile, user_data)))
 
     def _as_dds(self, topic: str, typename: str, profile: Any, user_data: str) -> tuple[Topic[Any], Qos]:
+        """Return topic and QoS of an endpoint."""
         key = (topic, typename)
         if key not in self._topics:
             self._topics[key] = Topic(self.dds, topic, idl.struct(typename))
         return self._topics[key], to_dds_qos(profile, f"{user_data}typehash={messages.type_hash(typename)};")
 
     def endpoints(self, kind: str) -> list[Any]:
-        """All writers ("publication") or readers ("subscription") on the domain, our own included."""
+        """List all endpoints on the domain, those of this process included.
+
+        Args:
+            kind: `publication` or `subscription`.
+
+        Returns:
+            Cyclone's descriptions of the endpoints.
+        """
         if kind not in self._endpoints or self._news[kind].triggered:
             found = self._builtin[kind].read(N=100_000)
             alive = [end for end in found if end.sample_info.instance_state == InstanceState.Alive]
@@ -117,83 +178,168 @@ class Participant:
         return self._endpoints[kind]
 
     def count(self, kind: str, topic: str) -> int:
+        """Count the endpoints of a topic.
+
+        Args:
+            kind: `publication` or `subscription`.
+            topic: Name of the DDS topic.
+
+        Returns:
+            Number of endpoints.
+        """
         return sum(endpoint.topic_name == topic for endpoint in self.endpoints(kind))
 
     def close(self) -> None:
+        """Leave the domain."""
         delete(self.dds)
 
 
 class Writer:
-    """A DDS writer of ready CDR bytes."""
+    """DDS writer of serialized messages.
+
+    Attributes:
+        dds: Cyclone's writer.
+        handle: Instance handle, unsigned.
+        gid: Identity on the wire.
+    """
 
     def __init__(self, dds: DataWriter[Any]) -> None:
+        """Wrap a writer.
+
+        Args:
+            dds: Cyclone's writer.
+        """
         self.dds = dds
         self.handle = dds.instance_handle % 2**64  # Cyclone's Python layer gives it a sign
         self.gid = dds.guid.bytes
         self._sample: Any = dds.topic.data_type
 
     def write(self, data: bytes | bytearray) -> None:
+        """Send a sample.
+
+        Args:
+            data: CDR bytes.
+        """
         self.dds.write(self._sample(data))
 
     def matched(self) -> list[Any]:
-        """The readers that get what is written."""
+        """List the readers that receive the samples.
+
+        Returns:
+            Cyclone's descriptions of the readers.
+        """
         found = (self.dds.get_matched_subscription_data(h) for h in self.dds.get_matched_subscriptions())
         return [reader for reader in found if reader is not None]
 
     def count(self) -> int:
+        """Count the readers that receive the samples.
+
+        Returns:
+            Number of readers.
+        """
         return len(self.dds.get_matched_subscriptions())
 
     def close(self) -> None:
+        """Delete the writer."""
         delete(self.dds)
 
 
 class Reader:
-    """A DDS reader of CDR bytes, with the condition that wakes an executor."""
+    """DDS reader of serialized messages with a condition that wakes an executor.
+
+    Attributes:
+        dds: Cyclone's reader.
+        condition: Condition that holds while samples wait.
+        gid: Identity on the wire.
+        is_closed: Whether the reader is deleted.
+    """
 
     def __init__(self, dds: DataReader[Any]) -> None:
+        """Wrap a reader.
+
+        Args:
+            dds: Cyclone's reader.
+        """
         self.dds = dds
         self.condition = core.ReadCondition(dds, ANY)
         self.gid = dds.guid.bytes
         self.is_closed = False
 
     def has_data(self) -> bool:
+        """Return whether samples wait.
+
+        Returns:
+            Whether `take` may return a sample.
+        """
         return not self.is_closed and self.condition.triggered
 
     def take(self) -> tuple[bytes, Any] | None:
-        """The oldest sample that waits and its DDS sample info, or None."""
+        """Take the oldest sample.
+
+        Returns:
+            CDR bytes and Cyclone's sample info; None if no sample waits.
+        """
         while not self.is_closed:
             samples = self.dds.take(1)
             if not samples:
                 return None
             info = samples[0].sample_info
-            if info.valid_data:  # else: news of a writer that left, which ROS 2 does not tell
+            if info.valid_data:  # else: a writer has left, which ROS 2 does not report
                 return samples[0].data, info
         return None
 
     def count(self) -> int:
+        """Count the writers that are received.
+
+        Returns:
+            Number of writers.
+        """
         return len(self.dds.get_matched_publications())
 
     def writer_of(self, info: Any) -> Any:
-        """The endpoint that wrote a sample, or None if it left."""
+        """Find the writer of a sample.
+
+        Args:
+            info: Sample info of the sample.
+
+        Returns:
+            Cyclone's description of the writer; None if it has left.
+        """
         return self.dds.get_matched_publication_data(info.publication_handle)
 
     def close(self) -> None:
+        """Delete the reader."""
         self.is_closed = True
         delete(self.condition)
         delete(self.dds)
 
 
 class WaitSet:
-    """Waits until one of a changing set of readers has data, or until another thread wakes it."""
+    """Waits until one of several readers has data, or until another thread calls `wake`.
+
+    Attributes:
+        dds: Cyclone's wait set.
+        guard: Condition that `wake` triggers.
+        readers: Readers that are waited for.
+    """
 
     def __init__(self, participant: Participant) -> None:
+        """Create a wait set without readers.
+
+        Args:
+            participant: Participant of the readers.
+        """
         self.dds = core.WaitSet(participant.dds)
         self.guard = core.GuardCondition(participant.dds)
         self.dds.attach(self.guard)
         self.readers: set[Reader] = set()
 
     def update(self, readers: set[Reader]) -> None:
-        """Wait for these readers from now on."""
+        """Replace the readers.
+
+        Args:
+            readers: New readers.
+        """
         for reader in self.readers - readers:
             try:
                 self.dds.detach(reader.condition)
@@ -204,25 +350,46 @@ class WaitSet:
         self.readers = readers
 
     def wait(self, timeout_ns: int) -> None:
-        """Until a reader has data, the time-out, or a wake-up; returns at once if the participant has left."""
+        """Wait until a reader has data, the timeout, or `wake`.
+
+        Args:
+            timeout_ns: Timeout, ns.
+        """
         with contextlib.suppress(DDSException):
             self.dds.wait(timeout_ns)
             self.guard.take()
 
     def wake(self) -> None:
+        """End the present or the next wait; may be called from any thread."""
         with contextlib.suppress(DDSException):  # the participant has left
             self.guard.set(True)
 
     def close(self) -> None:
+        """Delete the wait set."""
         delete(self.guard)
         delete(self.dds)
 
 
 class CallEndpoint:
-    """A client's or a service's writer and reader; every sample starts with (client id, sequence number)."""
+    """Writer and reader of a client or a service; samples start with (client id, sequence number).
+
+    Attributes:
+        writer: Writer of requests (client) or replies (service).
+        reader: Reader of replies (client) or requests (service).
+        client_id: Id of a client in request headers.
+    """
 
     def __init__(self, place: Participant, typename: str, name: str, profile: Any, serves: bool) -> None:
         # Tells which writer and reader belong together, as in rmw_cyclonedds.
+        """Create writer and reader.
+
+        Args:
+            place: Participant of this process.
+            typename: Full name of the service type.
+            name: Full name of the service.
+            profile: QoS profile.
+            serves: True for a service, False for a client.
+        """
         identity = ".".join(f"{byte:02x}" for byte in uuid.uuid4().bytes)
         own, self._other = ("serviceid=", "clientid=") if serves else ("clientid=", "serviceid=")
         request = (f"rq{name}Request", f"{typename}_Request")
@@ -233,38 +400,84 @@ class CallEndpoint:
         self.client_id = self.writer.handle
 
     def understands(self, endpoint: Any) -> bool:
-        """Whether an endpoint of the other side matches requests and replies as we do."""
+        """Return whether an endpoint matches requests and replies as rmw_cyclonedds does.
+
+        Args:
+            endpoint: Cyclone's description of the endpoint.
+
+        Returns:
+            Whether its user data says so.
+        """
         return Policy.Userdata in endpoint.qos and self._other in endpoint.qos[Policy.Userdata].data.decode()
 
     def is_matched(self) -> bool:
+        """Return whether the other side is connected.
+
+        Returns:
+            Whether calls can be sent and received.
+        """
         return self.reader.count() > 0 and any(map(self.understands, self.writer.matched()))
 
     def ask(self, request: Any, number: int) -> None:
-        """Send a request, if somebody is there who understands it."""
+        """Send a request if a service is connected.
+
+        Args:
+            request: The request.
+            number: Sequence number.
+        """
         if self.is_matched():
             self.writer.write(messages.serialize(request, REQUEST_HEADER.pack(self.client_id, number)))
 
     def answer(self, response: Any, request_id: tuple[int, int], client: Any) -> bool:
-        """Answer if the client's reader is matched, and say whether it is: before, the answer would be lost."""
+        """Send a reply if the client's reader is connected; earlier it would be lost.
+
+        Args:
+            response: The reply.
+            request_id: Client id and sequence number of the request.
+            client: Cyclone's description of the client's writer.
+
+        Returns:
+            Whether the reply was sent.
+        """
         if all(reader.participant_key != client.participant_key for reader in self.writer.matched()):
             return False
         self.writer.write(messages.serialize(response, REQUEST_HEADER.pack(*request_id)))
         return True
 
     def decode(self, data: bytes, typename: str) -> tuple[tuple[int, int], Any]:
-        """((client id, sequence number), message). Raises ValueError on malformed data."""
+        """Deserialize a request or reply.
+
+        Args:
+            data: CDR bytes.
+            typename: Full name of the request or response type.
+
+        Returns:
+            (client id, sequence number), and the message.
+
+        Raises:
+            ValueError: The data are malformed.
+        """
         if len(data) < 4 + REQUEST_HEADER.size:
             raise ValueError(f"{typename}: {len(data)} bytes hold no request header")
         client_id, number = REQUEST_HEADER.unpack_from(data, 4)
         return (client_id, number), messages.deserialize(data, typename, REQUEST_HEADER.size)
 
     def close(self) -> None:
+        """Delete writer and reader."""
         self.writer.close()
         self.reader.close()
 
 
 def to_dds_qos(profile: Any, user_data: str) -> Qos:
-    """DDS QoS of a `rclpy.qos.QoSProfile`, as rmw_cyclonedds maps it."""
+    """Convert a QoS profile as rmw_cyclonedds does.
+
+    Args:
+        profile: A `rclpy.qos.QoSProfile`.
+        user_data: User data of the endpoint.
+
+    Returns:
+        Cyclone's QoS.
+    """
     keep_all = profile.history.name == "KEEP_ALL"
     history = Policy.History.KeepAll if keep_all else Policy.History.KeepLast(max(profile.depth, 1))
     reliable = Policy.Reliability.Reliable(duration(infinite=True))

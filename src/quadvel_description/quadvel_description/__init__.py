@@ -1,1 +1,1 @@
-"""What the robot is: joint table, limits, postures, kinematics, symmetry, MJCF and URDF of the Unitree AlienGo."""
+"""Model of the Unitree AlienGo: joints, limits, postures, kinematics, symmetry, MJCF, URDF."""

@@ -1,4 +1,4 @@
-"""YAML of files that somebody else may have written: no tags of Python, and bounds on size, depth and aliases."""
+"""YAML loader for untrusted files: no Python tags, and bounds on size, depth and aliases."""
 
 from __future__ import annotations
 
@@ -7,37 +7,59 @@ from typing import Any, NoReturn
 
 import yaml
 
-LARGEST = 200_000
-"""Characters of a file; PyYAML reads some 50,000 a second"""
-LONGEST_SCALAR = 10_000
-"""Characters of one value; numbers to the base of 60 take time that grows with its square"""
-MOST_NODES = 100_000
-"""Values, lists and mappings of a file, with those that aliases repeat: about what a text of LARGEST may have"""
-DEEPEST = 20
-"""Lists and mappings in each other"""
+MAX_CHARACTERS = 200_000
+"""Largest number of characters of a file; PyYAML reads some 50,000 per second."""
+MAX_SCALAR_CHARACTERS = 10_000
+"""Largest number of characters of a value; base-60 numbers take quadratic time."""
+MAX_NODES = 100_000
+"""Largest number of values, lists and mappings; those under an alias count each time."""
+MAX_DEPTH = 20
+"""Largest number of nested lists and mappings."""
 
 
 class BoundedLoader(yaml.SafeLoader):
-    """Refuses what may cost much more time or memory than its text is long."""
+    """Safe YAML loader that refuses documents whose cost exceeds their length.
+
+    Aliases may make a short text expand to many values ("billion laughs"): values under an alias
+    count each time they are used.
+    """
 
     def __init__(self, stream: str) -> None:
+        """Start to load a text.
+
+        Args:
+            stream: The text.
+        """
         super().__init__(stream)
         self._depth = self._count = 0
         self._sizes: dict[str | None, int] = {}  # nodes under each anchor
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """A node. Raises YAMLError for one that is too deep or too long, and for too many, those under an alias counted again."""
+        """Compose a node and count it.
+
+        Args:
+            parent: Node that contains it.
+            index: Place in its parent.
+
+        Returns:
+            The node.
+
+        Raises:
+            yaml.YAMLError: The document is too deep, has too many values, or a value is too long.
+        """
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
         before = self._count
         self._count += self._sizes.get(event.anchor, 1) if isinstance(event, yaml.AliasEvent) else 1
         self._depth += 1
-        if self._depth > DEEPEST:
-            self._refuse(f"more than {DEEPEST} levels, expected fewer", event)
-        if self._count > MOST_NODES:
-            self._refuse(f"more than {MOST_NODES} values, those of aliases included, expected fewer", event)
-        if isinstance(event, yaml.ScalarEvent) and len(event.value) > LONGEST_SCALAR:
-            self._refuse(
-                f"a value of {len(event.value)} characters, expected {LONGEST_SCALAR} at most", event
+        if self._depth > MAX_DEPTH:
+            self._raise_yaml_error(f"more than {MAX_DEPTH} levels, expected fewer", event)
+        if self._count > MAX_NODES:
+            self._raise_yaml_error(
+                f"more than {MAX_NODES} values, those of aliases included, expected fewer", event
+            )
+        if isinstance(event, yaml.ScalarEvent) and len(event.value) > MAX_SCALAR_CHARACTERS:
+            self._raise_yaml_error(
+                f"a value of {len(event.value)} characters, expected {MAX_SCALAR_CHARACTERS} at most", event
             )
         node = super().compose_node(parent, index)
         self._depth -= 1
@@ -46,32 +68,64 @@ class BoundedLoader(yaml.SafeLoader):
         return node
 
     @staticmethod
-    def _refuse(found: str, event: Any) -> NoReturn:
+    def _raise_yaml_error(found: str, event: Any) -> NoReturn:
+        """Raise a YAMLError with line and column of the event."""
         mark = event.start_mark
         raise yaml.YAMLError(f"found {found}, in line {mark.line + 1}, column {mark.column + 1}")
 
 
 def load_yaml(text: str, loader: type[BoundedLoader] = BoundedLoader) -> Any:
-    """The document in a text. Raises ValueError that says what is wrong with it, on one line."""
-    if len(text) > LARGEST:
-        raise ValueError(f"found more than {LARGEST} characters, expected fewer")
+    """Parse a YAML text.
+
+    Args:
+        text: The text.
+        loader: Class of the loader.
+
+    Returns:
+        The document.
+
+    Raises:
+        ValueError: The text is no valid YAML or exceeds a bound; the message is one line.
+    """
+    if len(text) > MAX_CHARACTERS:
+        raise ValueError(f"found more than {MAX_CHARACTERS} characters, expected fewer")
     try:
         return loader(text).get_single_data()
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(" ".join(str(error).split())) from None
 
 
-def bounded_text(path: Path) -> str:
-    """What `load_yaml` may read of a file, and of a longer one so much that it refuses it. Raises OSError, UnicodeDecodeError."""
+def read_bounded_text(path: Path) -> str:
+    """Read a file, at most one character more than `load_yaml` accepts.
+
+    Args:
+        path: Path of the file.
+
+    Returns:
+        Its text. OSError and UnicodeDecodeError propagate.
+    """
     with path.open(encoding="utf-8") as file:
-        return file.read(LARGEST + 1)
+        return file.read(MAX_CHARACTERS + 1)
 
 
-def read_yaml(path: Path, what: str) -> Any:
-    """The document in a file. Raises ValueError that names the file, and OSError. what: it should be, `a YAML file of a world`."""
+def read_yaml(path: Path, expected: str) -> Any:
+    """Parse a YAML file. OSError propagates.
+
+    Args:
+        path: Path of the file.
+        expected: Description of the expected content for the error message, such as `a YAML file of
+            a world`.
+
+    Returns:
+        The document.
+
+    Raises:
+        ValueError: The file is no text, no valid YAML, or exceeds a bound; the message names the
+            file.
+    """
     try:
-        return load_yaml(bounded_text(path))
+        return load_yaml(read_bounded_text(path))
     except UnicodeDecodeError:
-        raise ValueError(f"{path}: no text, expected {what}") from None
+        raise ValueError(f"{path}: no text, expected {expected}") from None
     except ValueError as error:
         raise ValueError(f"{path}: no valid YAML: {error}") from None

@@ -1,8 +1,8 @@
-"""What the drives are asked for where a joint target lies beyond the range of commands (docs/decisions/0018).
+"""Joint targets beyond the command range: a clipped target plus feed-forward torque (decision 18).
 
-A soft gain needs targets far from the joint to push with: at 30 N m/rad a bent knee gets no more than some 24 N m out of
-targets within its range, half of what it can give. What a target has beyond the range goes along as feed-forward torque,
-so that the joint does what the whole target would make it do.
+A soft gain needs targets far from the joint to produce torque. At 30 N m/rad, targets within the
+range of a bent knee give about 24 N m, half of the available torque. The part of a target that lies
+beyond the range is therefore sent as feed-forward torque, so that the joint torque is the same.
 """
 
 from __future__ import annotations
@@ -12,27 +12,42 @@ from numpy.typing import ArrayLike, NDArray
 
 from .robot import COMMAND_LOWER, COMMAND_UPPER, LOWER, TORQUE_LIMIT, UPPER
 
-STOP_STIFFNESS = 100.0  # N m/rad: so much torque into a mechanical stop for the way that is left to it
+STOP_STIFFNESS_NM_PER_RAD = 100.0
+"""Largest feed-forward torque toward a mechanical stop by the remaining distance to it."""
 
 Array = NDArray[np.float64]
 
 
-def held(target: ArrayLike) -> Array:
-    """Targets (..., 12), rad, held to the range of commands."""
+def clip_to_command_range(target: ArrayLike) -> Array:
+    """Clip joint targets to the command range.
+
+    Args:
+        target: Joint targets, (..., 12), rad.
+
+    Returns:
+        Clipped targets, (..., 12), rad.
+    """
     return np.minimum(np.maximum(target, COMMAND_LOWER), COMMAND_UPPER)
 
 
-def within_range(target: ArrayLike, kp: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
-    """Targets (rad) held to the range of commands, and the torques (N m) that stand for the rest; (..., 12) all.
+def split_target(target: ArrayLike, kp: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
+    """Split joint targets into targets within the command range and feed-forward torques.
 
-    target, q: rad, wanted and measured; kp: N m/rad. A torque towards a mechanical stop fades out on the last of the way,
-    and none is beyond the drive's limit.
+    Args:
+        target: Joint targets, (..., 12), rad.
+        kp: Proportional gains, (..., 12) or a number, N m/rad.
+        q: Measured joint positions, (..., 12), rad.
+
+    Returns:
+        Clipped targets, (..., 12), rad, and torques, (..., 12), N m.
     """
     target, kp, q = (np.asarray(x, float) for x in (target, kp, q))
-    sent = held(target)
+    sent = clip_to_command_range(target)
     torque: Array = kp * (target - sent)
+    # tau = kp (target - clip(target)), bounded by the drive's limit; toward a mechanical stop it
+    # decreases to zero over the last part: |tau| <= min(K_stop * distance, tau_max).
     if torque.any():
-        up = np.minimum(np.maximum(STOP_STIFFNESS * (UPPER - q), 0.0), TORQUE_LIMIT)
-        down = np.minimum(np.maximum(STOP_STIFFNESS * (q - LOWER), 0.0), TORQUE_LIMIT)
+        up = np.minimum(np.maximum(STOP_STIFFNESS_NM_PER_RAD * (UPPER - q), 0.0), TORQUE_LIMIT)
+        down = np.minimum(np.maximum(STOP_STIFFNESS_NM_PER_RAD * (q - LOWER), 0.0), TORQUE_LIMIT)
         torque = np.minimum(np.maximum(torque, -down), up)
     return sent, torque

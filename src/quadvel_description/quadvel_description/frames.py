@@ -1,10 +1,11 @@
-"""The robot's coordinate frames, named as REP 105 and Nav2 expect them, and where each lies in its parent.
+"""Coordinate frames of the robot, named as in REP 105, and their poses in their parents.
 
-    odom -> base_link -> base_footprint                 the floor below the robot, level, with its heading
-                      -> trunk -> imu_link, the links of the legs
-                      -> laser                         where there is one; who serves it says where
+    odom -> base_link -> base_footprint            floor below the robot, level, with its heading
+                      -> trunk -> imu_link, links of the legs
+                      -> laser                     if there is one; its publisher knows the pose
 
-`base_link` and `trunk` are the same place: the trunk carries the mass, and KDL wants a root of the URDF without any.
+`base_link` and `trunk` coincide. The trunk carries the mass, and KDL requires a root link of the
+URDF without inertia.
 """
 
 from __future__ import annotations
@@ -31,7 +32,14 @@ _AXES = np.array([{"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0)}[link.axis] for li
 
 @attrs.frozen
 class Placed:
-    """Where the frame `child` lies in the frame `parent`: its origin (3,) m and its orientation (4,), wxyz."""
+    """Pose of a frame in its parent frame.
+
+    Attributes:
+        parent: Name of the parent frame.
+        child: Name of the frame.
+        position: Origin of the child in the parent, (3,), m.
+        quaternion: Orientation, child to parent, (4,), (w, x, y, z).
+    """
 
     parent: str
     child: str
@@ -40,13 +48,24 @@ class Placed:
 
 
 def fixed_links() -> list[Placed]:
-    """The links that never move in their parents, the trunk in `base_link` first."""
+    """Return the poses of the links that never move in their parents.
+
+    Returns:
+        Poses, the trunk in `base_link` first.
+    """
     links = [link for link in robot.LINKS if not link.axis]
     return [Placed(link.parent or BASE, link.name, np.array(link.origin), _IDENTITY) for link in links]
 
 
 def moving_links(q: Array) -> list[Placed]:
-    """Hips, thighs and calves at the joint angles q, (12,) rad."""
+    """Compute the poses of hips, thighs and calves in their parent links.
+
+    Args:
+        q: Joint positions, (12,), rad.
+
+    Returns:
+        A pose per joint.
+    """
     quaternions = np.column_stack([np.cos(0.5 * q), np.sin(0.5 * q)[:, None] * _AXES])
     return [
         Placed(str(link.parent), link.name, np.array(link.origin), quaternion)
@@ -55,14 +74,23 @@ def moving_links(q: Array) -> list[Placed]:
 
 
 def footprint(q: Array, quaternion: Array) -> Placed:
-    """`base_footprint` in `base_link`: below it on the floor that the lowest foot touches, level, with its heading.
+    """Compute the pose of `base_footprint` in `base_link`.
 
-    q: (12,) rad. quaternion: the trunk's orientation (4,), wxyz.
+    It lies below the robot on a level floor that the lowest foot touches, and has the robot's
+    heading.
+
+    Args:
+        q: Joint positions, (12,), rad.
+        quaternion: Orientation of the trunk, body to world, (4,), (w, x, y, z).
+
+    Returns:
+        The pose.
     """
+    # Tilt of the trunk without its heading: q_tilt = q_yaw^-1 q. The footprint has its inverse.
     half = 0.5 * float(yaw(quaternion))
     c, s = np.cos(half), np.sin(half)
     w, x, y, z = quaternion
-    tilt = np.array([c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w])  # less the heading
+    tilt = np.array([c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w])
     floor = rotate(tilt, foot_positions(q))[..., 2].min() - robot.FOOT_RADIUS
     below = rotate_inverse(tilt, np.array([0.0, 0.0, floor]))
     return Placed(BASE, FOOTPRINT, below, tilt * [1.0, -1.0, -1.0, -1.0])

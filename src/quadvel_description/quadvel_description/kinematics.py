@@ -1,4 +1,4 @@
-"""Leg kinematics and rotations in closed form, over any leading axes. Frames: facts in `robot`; no dynamics here."""
+"""Leg kinematics and rotations in closed form, with any leading batch axes."""
 
 from __future__ import annotations
 
@@ -6,42 +6,70 @@ import numpy as np
 
 from .robot import CALF_LENGTH, FRONT, HIP_OFFSET, LEFT, LEGS, THIGH_LENGTH, THIGH_OFFSET
 
-_SIDEWAYS = THIGH_OFFSET * np.array([LEFT[leg] for leg in LEGS], float)
-_LINKS = -np.array([THIGH_LENGTH, CALF_LENGTH])
+_LATERAL_OFFSETS = THIGH_OFFSET * np.array([LEFT[leg] for leg in LEGS], float)
+_LINK_LENGTHS = -np.array([THIGH_LENGTH, CALF_LENGTH])
 HIPS = np.array([[HIP_OFFSET[0] * FRONT[leg], HIP_OFFSET[1] * LEFT[leg], 0.0] for leg in LEGS])
 """Hip joints in the trunk frame, (4, 3), m."""
 
 
 def _leg_planes(q: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Of each leg's own plane: thigh's and calf's way forward and up, (..., 4, 2) each, sine and cosine of the hip."""
+    """Return the links of each leg in its own plane.
+
+    Returns forward and up components of thigh and calf, (..., 4, 2) each, and sine and cosine of
+    the hip, (..., 4) each.
+    """
     angles = np.array(q, float).reshape(*np.shape(q)[:-1], 4, 3)
     angles[..., 2] += angles[..., 1]
     sines, cosines = np.sin(angles), np.cos(angles)
-    return sines[..., 1:] * _LINKS, cosines[..., 1:] * _LINKS, sines[..., 0], cosines[..., 0]
+    return sines[..., 1:] * _LINK_LENGTHS, cosines[..., 1:] * _LINK_LENGTHS, sines[..., 0], cosines[..., 0]
 
 
-def _from_hips(forward: np.ndarray, up: np.ndarray, s: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """The feet as seen from the hip joints, (..., 4, 3)."""
+def _feet_from_hips(forward: np.ndarray, up: np.ndarray, s: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Return the foot positions relative to the hip joints, (..., 4, 3)."""
     feet, z = np.empty((*s.shape, 3)), up[..., 0] + up[..., 1]
     feet[..., 0] = forward[..., 0] + forward[..., 1]
-    feet[..., 1], feet[..., 2] = _SIDEWAYS * c - z * s, _SIDEWAYS * s + z * c
+    feet[..., 1], feet[..., 2] = _LATERAL_OFFSETS * c - z * s, _LATERAL_OFFSETS * s + z * c
     return feet
 
 
 def foot_positions(q: np.ndarray) -> np.ndarray:
-    """Centres of the foot spheres in the trunk frame, (..., 12) rad -> (..., 4, 3) m."""
-    return _from_hips(*_leg_planes(q)) + HIPS
+    """Compute the centres of the foot spheres in the trunk frame.
+
+    Args:
+        q: Joint positions, (..., 12), rad.
+
+    Returns:
+        Positions, (..., 4, 3), m.
+    """
+    return _feet_from_hips(*_leg_planes(q)) + HIPS
 
 
 def foot_jacobians(q: np.ndarray) -> np.ndarray:
-    """d foot / d (hip, thigh, calf) in the trunk frame, (..., 12) -> (..., 4, 3, 3), m/rad; columns are joints."""
+    """Compute the Jacobians of the foot positions.
+
+    Args:
+        q: Joint positions, (..., 12), rad.
+
+    Returns:
+        d foot / d (hip, thigh, calf) in the trunk frame, (..., 4, 3, 3), m/rad; columns are joints.
+    """
     return foot_kinematics(q)[1]
 
 
 def foot_kinematics(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`foot_positions` and `foot_jacobians` at once."""
+    """Compute foot positions and Jacobians together.
+
+    Args:
+        q: Joint positions, (..., 12), rad.
+
+    Returns:
+        Positions, (..., 4, 3), m, and Jacobians, (..., 4, 3, 3), m/rad; columns are joints.
+    """
     forward, up, s, c = _leg_planes(q)
-    feet = _from_hips(forward, up, s, c)
+    feet = _feet_from_hips(forward, up, s, c)
+    # Hip about x: d foot / d hip = (0, -z, y). Thigh and calf turn in the leg's plane about their
+    # joint: with x forward and z up of the foot relative to the joint, d foot / d angle is
+    # (z, x sin(hip), -x cos(hip)).
     jacobians = np.zeros((*feet.shape, 3))
     jacobians[..., 1, 0], jacobians[..., 2, 0] = -feet[..., 2], feet[..., 1]
     for joint, x, z in ((1, feet[..., 0], up[..., 0] + up[..., 1]), (2, forward[..., 1], up[..., 1])):
@@ -51,16 +79,21 @@ def foot_kinematics(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def inverse_kinematics(feet: np.ndarray) -> np.ndarray:
-    """Joint angles that put the foot centres at `feet`, trunk frame, (..., 4, 3) m -> (..., 12) rad.
+    """Compute the joint positions that reach given foot positions; knees bend backward.
 
-    Knees bend backward (calf negative). A foot out of reach is placed at the nearest reachable distance.
+    Args:
+        feet: Foot centres in the trunk frame, (..., 4, 3), m.
+
+    Returns:
+        Joint positions, (..., 12), rad; a foot out of reach goes to the nearest reachable distance.
     """
     p = np.asarray(feet, float) - HIPS
     x, y, z = p[..., 0], p[..., 1], p[..., 2]
-    depth = np.sqrt(
-        np.maximum(y**2 + z**2 - THIGH_OFFSET**2, 1e-8)
-    )  # leg plane: foot at depth below the thigh joint
-    hip = np.arctan2(z, y) - np.arctan2(-depth, _SIDEWAYS)
+    # The hip turns the leg's plane until the foot lies at `depth` below the thigh joint in it:
+    # depth^2 = y^2 + z^2 - offset^2. In the plane the law of cosines gives the knee:
+    # cos(calf) = (reach^2 - l1^2 - l2^2) / (2 l1 l2).
+    depth = np.sqrt(np.maximum(y**2 + z**2 - THIGH_OFFSET**2, 1e-8))
+    hip = np.arctan2(z, y) - np.arctan2(-depth, _LATERAL_OFFSETS)
     hip = np.arctan2(np.sin(hip), np.cos(hip))
     reach = np.clip(np.hypot(x, depth), abs(THIGH_LENGTH - CALF_LENGTH) + 1e-6, THIGH_LENGTH + CALF_LENGTH)
     cos_knee = (reach**2 - THIGH_LENGTH**2 - CALF_LENGTH**2) / (2 * THIGH_LENGTH * CALF_LENGTH)
@@ -71,7 +104,10 @@ def inverse_kinematics(feet: np.ndarray) -> np.ndarray:
 
 
 def _rotation_tensor() -> np.ndarray:
-    """R as a quadratic form in q = (w, u), (16, 9): R_ab = (w^2 - u.u) delta_ab + 2 u_a u_b - 2 w eps_abc u_c."""
+    """Return R as a quadratic form in q = (w, u), (16, 9).
+
+    R_ab = (w^2 - u.u) delta_ab + 2 u_a u_b - 2 w eps_abc u_c.
+    """
     eye = np.eye(3)
     tensor = np.zeros((4, 4, 3, 3))
     tensor[0, 0] = eye
@@ -84,31 +120,68 @@ _ROTATION = _rotation_tensor()
 
 
 def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Body to world of a unit quaternion wxyz, (..., 4) -> (..., 3, 3)."""
+    """Compute the rotation matrix of a unit quaternion.
+
+    Args:
+        quaternion: Orientation, body to world, (..., 4), (w, x, y, z).
+
+    Returns:
+        Matrix that rotates body vectors to the world frame, (..., 3, 3).
+    """
     q = np.asarray(quaternion)
     squares = (q[..., :, None] * q[..., None, :]).reshape(*q.shape[:-1], 16)
     return (squares @ _ROTATION).reshape(*q.shape[:-1], 3, 3)
 
 
 def rotate(quaternion: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Body vector to world: R(quaternion wxyz) v, (..., 4), (..., 3) -> (..., 3)."""
+    """Rotate body vectors to the world frame: R(q) v.
+
+    Args:
+        quaternion: Orientation, body to world, (..., 4), (w, x, y, z).
+        v: Vectors in the body frame, (..., 3).
+
+    Returns:
+        Vectors in the world frame, (..., 3).
+    """
     return (rotation_matrix(quaternion) @ np.asarray(v)[..., None])[..., 0]
 
 
 def rotate_inverse(quaternion: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """World vector to body: R(quaternion wxyz)^T v."""
+    """Rotate world vectors to the body frame: R(q)^T v.
+
+    Args:
+        quaternion: Orientation, body to world, (..., 4), (w, x, y, z).
+        v: Vectors in the world frame, (..., 3).
+
+    Returns:
+        Vectors in the body frame, (..., 3).
+    """
     return (np.asarray(v)[..., None, :] @ rotation_matrix(quaternion))[..., 0, :]
 
 
 def roll_pitch(quaternion: np.ndarray) -> np.ndarray:
-    """Roll and pitch (rad) of R = Rz(yaw) Ry(pitch) Rx(roll), (..., 4) -> (..., 2)."""
-    w, x, y, z = np.asarray(quaternion).T  # plain numbers for one robot, in which case these are quick
+    """Compute roll and pitch of R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Args:
+        quaternion: Orientation, body to world, (..., 4), (w, x, y, z).
+
+    Returns:
+        Roll and pitch, (..., 2), rad.
+    """
+    w, x, y, z = np.asarray(quaternion).T  # for one robot these are scalars, which is fast
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.minimum(np.maximum(2 * (w * y - z * x), -1.0), 1.0))
     return np.array((roll, pitch)).T
 
 
 def yaw(quaternion: np.ndarray) -> np.ndarray:
-    """Yaw (rad), (..., 4) -> (...)."""
+    """Compute the yaw angle of R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Args:
+        quaternion: Orientation, body to world, (..., 4), (w, x, y, z).
+
+    Returns:
+        Yaw, (...), rad.
+    """
     w, x, y, z = np.asarray(quaternion).T
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)).T

@@ -1,4 +1,7 @@
-"""The AlienGo as an MJCF of primitives, made from `robot`. Terrain beyond a plane is added by who simulates."""
+"""MuJoCo model (MJCF) of the AlienGo from geometric primitives and the numbers in `robot`.
+
+The caller adds any terrain other than a plane.
+"""
 
 from __future__ import annotations
 
@@ -12,25 +15,40 @@ from .robot import FOOT_RADIUS, KINDS, LEFT, LEGS
 
 
 def _text(values: ArrayLike) -> str:
+    """Return numbers as an attribute value."""
     return " ".join(repr(float(v)) for v in np.ravel(np.asarray(values, float)))
 
 
 @attrs.frozen(eq=False)
 class Plant:
-    """What may be varied of the robot in a simulation; defaults are the nominal AlienGo."""
+    """Properties of the robot's model that may vary; the defaults are the nominal AlienGo.
 
-    timestep: float = 0.001  # s
-    armature: np.ndarray = attrs.field(factory=lambda: robot.ARMATURE)  # (12,) kg m^2
-    joint_friction: np.ndarray = attrs.field(factory=lambda: robot.FRICTION)  # (12,) N m
-    joint_damping: np.ndarray = attrs.field(factory=lambda: robot.DAMPING)  # (12,) N m s/rad
-    foot_friction: float = 0.8  # sliding friction coefficient of foot and ground
-    plane: bool = True  # add a flat ground; False where the caller brings a terrain
-    only_feet_and_trunk: bool = False  # leave the legs' own collision shapes out (training: faster)
-    sensors: bool = True  # IMU sensors at the IMU site
-    hung: bool = False  # the trunk held at HUNG_HEIGHT, as on a stand: the feet are in the air
+    Attributes:
+        timestep: Time step of the simulation, s.
+        armature: Reflected rotor inertia, (12,), kg m^2.
+        joint_friction: Coulomb friction, (12,), N m.
+        joint_damping: Viscous friction, (12,), N m s/rad.
+        foot_friction: Sliding friction coefficient of the feet.
+        plane: Whether the model has a flat ground; False if the caller adds a terrain.
+        only_feet_and_trunk: Whether only feet and trunk collide, which is faster (training).
+        sensors: Whether the model has IMU sensors.
+        suspended: Whether the trunk is held at `SUSPENDED_HEIGHT` with the feet in the air, as on a
+            stand.
+    """
+
+    timestep: float = 0.001
+    armature: np.ndarray = attrs.field(factory=lambda: robot.ARMATURE)
+    joint_friction: np.ndarray = attrs.field(factory=lambda: robot.FRICTION)
+    joint_damping: np.ndarray = attrs.field(factory=lambda: robot.DAMPING)
+    foot_friction: float = 0.8
+    plane: bool = True
+    only_feet_and_trunk: bool = False
+    sensors: bool = True
+    suspended: bool = False
 
 
-def _leg(leg: str, plant: Plant) -> str:
+def _leg_xml(leg: str, plant: Plant) -> str:
+    """Return the bodies of a leg."""
     sy = LEFT[leg]
     first = 3 * LEGS.index(leg)
     shells = {
@@ -46,7 +64,7 @@ def _leg(leg: str, plant: Plant) -> str:
     for k in reversed(range(3)):
         kind = KINDS[k]
         link = next(item for item in robot.LINKS if item.name == f"{leg}_{kind}")
-        inertial = robot.lumped(link.name)
+        inertial = robot.combined_inertial(link.name)
         i = first + k
         axis = "1 0 0" if link.axis == "x" else "0 1 0"
         shell = (
@@ -56,7 +74,7 @@ def _leg(leg: str, plant: Plant) -> str:
         )
         inner = (
             f'<body name="{link.name}" pos="{_text(link.origin)}">'
-            f'<inertial mass="{_text(inertial.mass)}" pos="{_text(inertial.com)}" fullinertia="{_text(inertial.full())}"/>'
+            f'<inertial mass="{_text(inertial.mass)}" pos="{_text(inertial.com)}" fullinertia="{_text(inertial.fullinertia())}"/>'
             f'<joint name="{leg}_{kind}_joint" axis="{axis}" range="{_text([robot.LOWER[i], robot.UPPER[i]])}"'
             f' armature="{_text(plant.armature[i])}" frictionloss="{_text(plant.joint_friction[i])}"'
             f' damping="{_text(plant.joint_damping[i])}"/>'
@@ -65,14 +83,24 @@ def _leg(leg: str, plant: Plant) -> str:
     return inner
 
 
-def _keyframe(name: str, height: float, q: np.ndarray) -> str:
+def _keyframe_xml(name: str, height: float, q: np.ndarray) -> str:
+    """Return a keyframe with the trunk at a height (m) and joints `q`."""
     return f'<key name="{name}" qpos="0 0 {height!r} 1 0 0 0 {_text(q)}"/>'
 
 
 def mjcf(plant: Plant | None = None) -> str:
-    """The model as MJCF text. Motors take joint torque (N m), in the order of `robot.JOINT_NAMES`."""
+    """Create the model as MJCF text.
+
+    Motors take joint torques in N m in the order of `robot.JOINT_NAMES`.
+
+    Args:
+        plant: Variable properties; None: the nominal robot.
+
+    Returns:
+        MJCF text.
+    """
     plant = plant or Plant()
-    trunk = robot.lumped("trunk")
+    trunk = robot.combined_inertial("trunk")
     ground = (
         '<geom name="ground" type="plane" size="0 0 0.1" contype="1" conaffinity="0" material="ground"/>'
         if plant.plane
@@ -91,16 +119,16 @@ def mjcf(plant: Plant | None = None) -> str:
         f'<motor name="{name}" joint="{name}" ctrlrange="{-limit!r} {limit!r}"/>'
         for name, limit in zip(robot.JOINT_NAMES, robot.TORQUE_LIMIT.tolist(), strict=True)
     )
-    legs = "\n      ".join(_leg(leg, plant) for leg in LEGS)
+    legs = "\n      ".join(_leg_xml(leg, plant) for leg in LEGS)
     # relpose: where the world is, seen from the trunk
     stand = (
         f"""<equality>
-    <weld name="hung" body1="trunk" relpose="0 0 {-robot.HUNG_HEIGHT!r} 1 0 0 0" solref="0.004 1"/>
+    <weld name="hung" body1="trunk" relpose="0 0 {-robot.SUSPENDED_HEIGHT!r} 1 0 0 0" solref="0.004 1"/>
   </equality>"""
-        if plant.hung
+        if plant.suspended
         else ""
     )
-    heights = [robot.HUNG_HEIGHT] * 2 if plant.hung else [robot.NOMINAL_HEIGHT, robot.LIE_HEIGHT]
+    heights = [robot.SUSPENDED_HEIGHT] * 2 if plant.suspended else [robot.NOMINAL_HEIGHT, robot.LIE_HEIGHT]
     return f"""<mujoco model="aliengo">
   <compiler angle="radian" autolimits="true"/>
   <option timestep="{plant.timestep!r}" integrator="implicitfast" cone="elliptic" impratio="10"
@@ -127,7 +155,7 @@ def mjcf(plant: Plant | None = None) -> str:
     {ground}
     <body name="trunk" pos="0 0 {robot.NOMINAL_HEIGHT!r}">
       <freejoint name="root"/>
-      <inertial mass="{_text(trunk.mass)}" pos="{_text(trunk.com)}" fullinertia="{_text(trunk.full())}"/>
+      <inertial mass="{_text(trunk.mass)}" pos="{_text(trunk.com)}" fullinertia="{_text(trunk.fullinertia())}"/>
       <geom name="trunk" class="shell" type="box" size="0.3235 0.075 0.056" rgba="0.8 0.82 0.85 1"/>
       <site name="imu" pos="{_text(robot.IMU_POSITION)}" size="0.01"/>
       {legs}
@@ -139,28 +167,50 @@ def mjcf(plant: Plant | None = None) -> str:
   {sensors}
   {stand}
   <keyframe>
-    {_keyframe("stand", heights[0], robot.NOMINAL_Q)}
-    {_keyframe("lie", heights[1], robot.LIE_Q)}
+    {_keyframe_xml("stand", heights[0], robot.NOMINAL_Q)}
+    {_keyframe_xml("lie", heights[1], robot.LIE_Q)}
   </keyframe>
 </mujoco>
 """
 
 
 def build_spec(plant: Plant | None = None) -> mujoco.MjSpec:
-    """The model as an editable specification."""
+    """Create the model as an editable specification.
+
+    Args:
+        plant: Variable properties; None: the nominal robot.
+
+    Returns:
+        MuJoCo specification.
+    """
     return mujoco.MjSpec.from_string(mjcf(plant))
 
 
 def load_model(plant: Plant | None = None) -> mujoco.MjModel:
-    """The compiled model."""
+    """Create the compiled model.
+
+    Args:
+        plant: Variable properties; None: the nominal robot.
+
+    Returns:
+        Compiled MuJoCo model.
+    """
     return mujoco.MjModel.from_xml_string(mjcf(plant))
 
 
 def gravity_torque(model: mujoco.MjModel) -> np.ndarray:
-    """Joint torque (12,) N m that holds NOMINAL_Q while the four feet carry the robot's weight equally."""
+    """Compute the joint torques that hold NOMINAL_Q while the four feet share the weight equally.
+
+    Args:
+        model: Model of the robot.
+
+    Returns:
+        Torques, (12,), N m.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
     mujoco.mj_forward(model, data)
+    # Static equilibrium: tau = bias(q) - sum over feet of J^T (0, 0, weight / 4).
     weight = float(model.body_subtreemass[1]) * robot.GRAVITY
     torque = data.qfrc_bias[6:].copy()
     jacobian = np.zeros((3, model.nv))

@@ -1,7 +1,8 @@
-"""Reads an ONNX file as what it has to be here: data, that computes outputs from inputs and does nothing else.
+"""Safe reader of ONNX files: accepts data-flow graphs only.
 
-What is not on the lists below is refused before anything runs it: files of others it would have read, operators from
-elsewhere, control flow, sizes that no step has time for. What the network means is `recurrent_network`'s matter.
+Everything that is not on the lists below is refused before it runs: references to other files,
+custom operators, control flow, and sizes that are too large for a control step.
+`recurrent_network` interprets the network.
 """
 
 from __future__ import annotations
@@ -15,79 +16,93 @@ from pathlib import Path
 from google.protobuf.message import DecodeError, Message
 from onnx import ModelProto, TensorProto
 
-LARGEST = 16_000_000  # bytes, ten times the shipped policy; a core reads so many in a third of a 5 ms step
-MOST_PARTS = 50_000  # nodes, attributes, tensors and what else is told apart; the shipped policy has 100
-LARGEST_TENSOR = LARGEST // 4  # numbers
-OPSETS = range(13, 22)  # from the one that has axes as inputs to the last that onnxruntime 1.20 runs
+MAX_FILE_BYTES = 16_000_000
+"""Ten times the shipped policy; a core reads this many bytes in a third of a 5 ms step."""
+MAX_PARTS = 50_000
+"""Largest number of nested messages: nodes, attributes, tensors; the shipped policy has 100."""
+MAX_TENSOR_NUMBERS = MAX_FILE_BYTES // 4
+SUPPORTED_OPSETS = range(13, 22)
+"""From the first opset with axes as inputs to the last one that onnxruntime 1.20 runs."""
 
-# Of ONNX's own domain. None runs a subgraph, draws random numbers or makes an output as large as a number tells it.
-OPERATORS = """
+# Operators of ONNX's own domain. None of them runs a subgraph, draws random numbers, or creates an
+# output whose size is the value of an input.
+ALLOWED_OPERATORS = """
     Abs Acos Add And Asin Atan Cast Clip Concat Constant Cos Div Elu Equal Erf Exp Flatten Floor GRU Gather Gemm Greater
     GreaterOrEqual HardSigmoid Identity LSTM LayerNormalization LeakyRelu Less LessOrEqual Log MatMul Max Min Mod Mul Neg
     Not Or Pow RNN ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum Relu Reshape Round Selu Shape Sigmoid
     Sign Sin Slice Softmax Softplus Split Sqrt Squeeze Sub Tan Tanh Transpose Unsqueeze Where
     """
-# The fields of the format that hold others, but those for data elsewhere, subgraphs, functions, sparse tensors, training.
-PARTS = """
+# Message fields of the format; no external data, subgraphs, functions, sparse tensors, training.
+ALLOWED_PARTS = """
     ModelProto.graph ModelProto.metadata_props ModelProto.opset_import
     GraphProto.initializer GraphProto.input GraphProto.metadata_props GraphProto.node GraphProto.output
     GraphProto.value_info NodeProto.attribute NodeProto.metadata_props AttributeProto.t
     ValueInfoProto.type ValueInfoProto.metadata_props TypeProto.tensor_type TypeProto.Tensor.shape TensorShapeProto.dim
     """
-NUMBERS = TensorProto.FLOAT, TensorProto.INT32, TensorProto.INT64, TensorProto.BOOL
+ALLOWED_TENSOR_TYPES = TensorProto.FLOAT, TensorProto.INT32, TensorProto.INT64, TensorProto.BOOL
 
 
 class NetworkFileError(ValueError):
-    """A network file that is missing, unreadable or not what was asked for, in one sentence with its name."""
+    """A network file is missing, unreadable or of a wrong kind; the message names it."""
 
 
 def read_network(path: Path) -> ModelProto:
-    """The network in a file. Raises NetworkFileError for whatever is not on this module's lists.
+    """Read a network from a file.
 
-    What this version of the format does not know is not in it, so that who runs it sees what was looked at.
+    Unknown fields of the format are discarded, so that a later reader sees only what was checked.
+
+    Args:
+        path: Path of an ONNX file.
+
+    Returns:
+        The network.
+
+    Raises:
+        NetworkFileError: The file is missing or unreadable, or holds something that is not allowed.
     """
     if not path.is_file():
         raise NetworkFileError(f"{path}: no such file, expected an ONNX network")
     try:
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
-            content = file.read(LARGEST + 1)
+            content = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
         raise NetworkFileError(f"{path}: can't be read: {error.strerror}") from None
-    if len(content) > LARGEST:
-        found, expected = (f"{length / 1e6:.1f} MB" for length in (size, LARGEST))
+    if len(content) > MAX_FILE_BYTES:
+        found, expected = (f"{length / 1e6:.1f} MB" for length in (size, MAX_FILE_BYTES))
         raise NetworkFileError(f"{path}: has {found}, expected at most {expected} to be run at 200 Hz")
-    model = _parsed(content)
+    model = _parse_model(content)
     if model is None:
         start = content[:8]
         raise NetworkFileError(
             f"{path}: is not an ONNX network, or not a whole one: {size} bytes that begin with {start!r}"
         )
-    for problem in _problems(model):
+    for problem in _find_problems(model):
         raise NetworkFileError(f"{path}: {problem}")
     return model
 
 
-def _parsed(content: bytes) -> ModelProto | None:
+def _parse_model(content: bytes) -> ModelProto | None:
+    """Return the network in the bytes of a file, or None if they are no network."""
     model = ModelProto()
     try:
         model.ParseFromString(content)
     except DecodeError:
         return None
     model.DiscardUnknownFields()
-    return model if model.ir_version else None  # which every network has, and other files that parse have not
+    return model if model.ir_version else None  # every network has it; other parsable files do not
 
 
-def _problems(model: ModelProto) -> Iterator[str]:
-    """What is not as it has to be, in the order in which it is found."""
-    operators, known = OPERATORS.split(), PARTS.split()
-    parts = list(islice(_parts(model), MOST_PARTS + 1))
-    if len(parts) > MOST_PARTS:
-        yield f"has more than {MOST_PARTS} parts, expected fewer: so many operators are no step of 5 ms"
+def _find_problems(model: ModelProto) -> Iterator[str]:
+    """Yield a sentence for everything that is not allowed."""
+    operators, known = ALLOWED_OPERATORS.split(), ALLOWED_PARTS.split()
+    parts = list(islice(_iterate_parts(model), MAX_PARTS + 1))
+    if len(parts) > MAX_PARTS:
+        yield f"has more than {MAX_PARTS} parts, expected fewer: so many operators are no step of 5 ms"
     opsets = [(one.domain, one.version) for one in model.opset_import]
-    if len(opsets) != 1 or opsets[0][0] != "" or opsets[0][1] not in OPSETS:
+    if len(opsets) != 1 or opsets[0][0] != "" or opsets[0][1] not in SUPPORTED_OPSETS:
         found = ", ".join(f"{domain or 'ai.onnx'} {version}" for domain, version in opsets) or "none"
-        yield f"operators come from the sets {found}, expected ai.onnx {OPSETS[0]} to {OPSETS[-1]} alone"
+        yield f"operators come from the sets {found}, expected ai.onnx {SUPPORTED_OPSETS[0]} to {SUPPORTED_OPSETS[-1]} alone"
     for node in model.graph.node:
         if node.domain or node.op_type not in operators:
             name = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
@@ -95,34 +110,35 @@ def _problems(model: ModelProto) -> Iterator[str]:
     for place, part in parts:
         if place not in known:
             yield f"has a part {place}, expected none: a network here is one graph of operators and plain tensors"
-        if not _readable(part):
+        if not _has_utf8_text(part):
             yield f"has a part {place} with a text that is not UTF-8, expected names that can be read"
         if isinstance(part, TensorProto):
-            yield from _tensor_problems(part)
+            yield from _find_tensor_problems(part)
 
 
-def _tensor_problems(tensor: TensorProto) -> Iterator[str]:
+def _find_tensor_problems(tensor: TensorProto) -> Iterator[str]:
+    """Yield a sentence for every property of a tensor that is not allowed."""
     if tensor.data_location != TensorProto.DEFAULT:
         yield f"tensor {tensor.name!r} lies in another file, expected all data in this one"
-    if tensor.data_type not in NUMBERS:
-        expected = ", ".join(sorted(map(TensorProto.DataType.Name, NUMBERS)))
+    if tensor.data_type not in ALLOWED_TENSOR_TYPES:
+        expected = ", ".join(sorted(map(TensorProto.DataType.Name, ALLOWED_TENSOR_TYPES)))
         yield f"tensor {tensor.name!r} is of type {tensor.data_type}, expected {expected}"
-    if min(tensor.dims, default=0) < 0 or math.prod(tensor.dims) > LARGEST_TENSOR:
-        yield f"tensor {tensor.name!r} has the shape {list(tensor.dims)}, expected at most {LARGEST_TENSOR} numbers"
+    if min(tensor.dims, default=0) < 0 or math.prod(tensor.dims) > MAX_TENSOR_NUMBERS:
+        yield f"tensor {tensor.name!r} has the shape {list(tensor.dims)}, expected at most {MAX_TENSOR_NUMBERS} numbers"
 
 
-def _readable(part: Message) -> bool:
-    """Whether all texts of a part, those of others in it apart, are UTF-8; one that is not comes as bytes."""
+def _has_utf8_text(part: Message) -> bool:
+    """Return whether all texts of a part are UTF-8; protobuf returns other texts as bytes."""
     texts = [value for field, value in part.ListFields() if field.type == field.TYPE_STRING]
     return not any(
         isinstance(one, bytes) for text in texts for one in ([text] if isinstance(text, bytes) else text)
     )
 
 
-def _parts(whole: Message) -> Iterator[tuple[str, Message]]:
-    """All that a message holds, however deep, each with the field's name in the format."""
+def _iterate_parts(whole: Message) -> Iterator[tuple[str, Message]]:
+    """Yield all nested messages, each with the name of its field in the format."""
     for field, value in whole.ListFields():
         if field.message_type is not None:
             for part in [value] if isinstance(value, Message) else value:
                 yield field.full_name.removeprefix("onnx."), part
-                yield from _parts(part)
+                yield from _iterate_parts(part)

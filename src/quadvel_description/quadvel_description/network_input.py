@@ -1,8 +1,7 @@
-"""How named quantities become one network input: order, offset, scale and clip of each.
+"""Layout of a network's input: order, offset, scale and clipping of named quantities.
 
-The policy's observation and the velocity estimator's features are both described this way, in training,
-in simulation and on the robot, and the description travels inside the ONNX file. What the quantities mean
-is said where they are named.
+The policy's observation and the velocity estimator's features use this layout in training, in
+simulation and on the robot. The ONNX file carries it as metadata.
 """
 
 from __future__ import annotations
@@ -16,16 +15,23 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def _floats(value: float | Iterable[float]) -> float | tuple[float, ...]:
-    """A number, or a tuple of numbers, as JSON keeps them."""
+    """Return a number or a tuple of numbers, as JSON stores them."""
     return tuple(float(x) for x in value) if isinstance(value, Iterable) else float(value)
 
 
 @attrs.frozen
 class InputTerm:
-    """One named quantity of `size` numbers; the network sees clip((value - offset) * scale, -clip, clip).
+    """One named quantity; the network receives clip((value - offset) * scale, -clip, clip).
 
-    `offset` and `scale` are one number or `size` numbers, in the quantity's unit and its inverse; `clip` is a
-    bound or None.
+    Raises:
+        ValueError: The size is below 1, a length is wrong, or a number is not finite.
+
+    Attributes:
+        name: Name of the quantity.
+        size: Number of values.
+        offset: Offset in the quantity's unit, a number or `size` numbers.
+        scale: Scale in the inverse of the quantity's unit, a number or `size` numbers.
+        clip: Bound of the scaled value; None: unbounded.
     """
 
     name: str
@@ -48,13 +54,25 @@ class InputTerm:
 
 
 class InputLayout:
-    """The terms of a network's input in their order, as one vector of `size` float32 numbers."""
+    """Concatenation of terms to one vector of `size` float32 numbers.
+
+    Attributes:
+        terms: Terms in their order.
+        size: Length of the input.
+        names: Names of the terms in their order.
+        offset: Offset of each number of the input, (size,).
+        scale: Scale of each number of the input, (size,).
+    """
 
     def __init__(self, terms: Sequence[InputTerm]) -> None:
+        """Combine terms.
+
+        Args:
+            terms: Terms in their order.
+        """
         self.terms = tuple(terms)
         self.size = sum(term.size for term in self.terms)
         self.names = tuple(term.name for term in self.terms)
-        """The names of the terms in their order."""
 
         def spread(values: Iterable[Any]) -> NDArray[np.float64]:
             return np.concatenate(
@@ -63,12 +81,18 @@ class InputLayout:
 
         self.offset = spread(t.offset for t in self.terms)
         self.scale = spread(t.scale for t in self.terms)
-        """Of each number of the input, (size,)."""
         self._high = spread(np.inf if t.clip is None else t.clip for t in self.terms)
         self._low = -self._high
 
     def build(self, values: Mapping[str, ArrayLike]) -> NDArray[np.float32]:
-        """The input (..., size) from each term's value (..., term.size); all leading axes are the same."""
+        """Compute the network's input.
+
+        Args:
+            values: Value of each term, (..., term.size), with equal leading axes.
+
+        Returns:
+            Input, (..., size).
+        """
         built = np.concatenate([values[name] for name in self.names], axis=-1, dtype=np.float64)
         built -= self.offset
         built *= self.scale
@@ -76,14 +100,26 @@ class InputLayout:
         return np.minimum(built, self._high, out=built).astype(np.float32)
 
     def to_metadata(self) -> list[dict[str, Any]]:
-        """The list that a network file's metadata carries."""
+        """Return the layout for the metadata of a network file.
+
+        Returns:
+            A mapping per term.
+        """
         return [attrs.asdict(term) for term in self.terms]
 
     @classmethod
     def from_metadata(cls, entries: Any, known: Mapping[str, int]) -> InputLayout:
-        """Read `to_metadata`'s list; `known` maps each name that the reader can supply to its size.
+        """Read a layout from the metadata of a network file.
 
-        Raises ValueError naming the entry, what was found and what was expected.
+        Args:
+            entries: List that `to_metadata` returned.
+            known: Size of each quantity that the reader can supply, by name.
+
+        Returns:
+            The layout.
+
+        Raises:
+            ValueError: An entry is malformed or unknown; the message names it.
         """
         fields = [field.name for field in attrs.fields(InputTerm)]
         if not isinstance(entries, list) or not entries:

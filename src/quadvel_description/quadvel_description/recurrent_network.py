@@ -1,8 +1,7 @@
-"""An ONNX network with an LSTM's memory and a description of itself: policy files and estimator files.
+"""ONNX network with LSTM memory and metadata, run step by step: policies and estimators.
 
-Loads the file, checks by name that it is what the caller expects, and runs it one step at a time on one
-thread; who is pressed for time has part of a step done before its observation comes. What the inputs and
-outputs mean is the caller's matter.
+The file is checked by name against the caller's expectation. A step runs on one thread. A
+time-critical caller can compute a part of a step before the observation arrives, see `prepare`.
 """
 
 from __future__ import annotations
@@ -27,24 +26,25 @@ from .robot import JOINT_NAMES
 
 METADATA_KEY = "quadvel"
 SCHEMA = 1
-LONGEST = 10_000  # numbers, of one input
+MAX_INPUT_LENGTH = 10_000
+"""Largest number of values of one input."""
 MEMORY_INPUTS = ("h_in", "c_in")
 MEMORY_OUTPUTS = ("h_out", "c_out")
 
 
-def _options() -> onnxruntime.SessionOptions:
-    """Of sessions that run on one thread."""
+def _session_options() -> onnxruntime.SessionOptions:
+    """Return options of a session that runs on one thread."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
-    # At batch size one, weights are streamed as they lie; packed for larger products they are slower by a tenth.
+    # At batch size one, weights in their stored order are 10 % faster than prepacked ones.
     options.add_session_config_entry("session.disable_prepacking", "1")
     options.log_severity_level = 4  # what goes wrong is raised, not printed
     return options
 
 
-class _Run:
-    """A session tied to our arrays, by their names, so that a run looks up, converts and allocates nothing."""
+class _BoundRun:
+    """Session bound to arrays by name: a run looks up, converts and allocates nothing."""
 
     def __init__(
         self, session: onnxruntime.InferenceSession, arrays: Mapping[str, NDArray[np.float32]]
@@ -63,64 +63,82 @@ class _Run:
 
 
 class RecurrentNetwork:
-    """Inputs `obs` (1, n), `h_in`, `c_in`; outputs `outputs`, `h_out`, `c_out`; all float32.
+    """Recurrent network: inputs `obs` (1, n), `h_in`, `c_in`; outputs `h_out`, `c_out`; float32.
 
-    `outputs` gives the length m of each output (1, m) by its name, in order. `fields` are the metadata fields
-    that the caller needs besides `schema`, `joint_names` and `state_shape`, the shape of both memories. Raises
-    NetworkFileError.
+    Attributes:
+        path: Path of the file.
+        metadata: Metadata of the file.
     """
 
     def __init__(self, path: str | Path, outputs: Mapping[str, int], fields: Sequence[str] = ()) -> None:
+        """Load and check a network file.
+
+        Args:
+            path: Path of the file.
+            outputs: Length m of each further output (1, m), by name, in order.
+            fields: Required metadata fields in addition to `schema`, `joint_names` and
+                `state_shape` (the shape of both memories).
+
+        Raises:
+            NetworkFileError: The file is unreadable or does not match.
+        """
         self.path = Path(path)
         self._model = read_network(self.path)
-        self._session = self._open(self._model)
+        self._session = self._open_session(self._model)
         self.metadata = self._read_metadata(("schema", "joint_names", "state_shape", *fields))
         self._require("metadata field schema", self.metadata["schema"], SCHEMA)
         self._require("metadata field joint_names", self.metadata["joint_names"], list(JOINT_NAMES))
         self._outputs = dict(outputs)
         self._check_signature()
-        self._try_out()
+        self._run_on_zeros()
         self._input = np.zeros((1, self.input_size), np.float32)
-        self._result = np.zeros((1, sum(self._outputs.values())), np.float32)  # all outputs side by side
+        self._result = np.zeros((1, sum(self._outputs.values())), np.float32)  # all outputs, concatenated
         ends = np.cumsum([0, *self._outputs.values()]).tolist()
-        self._places = [slice(*place) for place in pairwise(ends)]
-        # Two memories that take turns: what one step writes, the next one reads, and nothing is copied.
+        self._output_slices = [slice(*place) for place in pairwise(ends)]
+        # Two alternating memories: each step reads what the previous one wrote, without a copy.
         self._memories = [
             [np.zeros(self.metadata["state_shape"], np.float32) for _ in "hc"] for _ in range(2)
         ]
-        self._whole = self._runs(self._session)
+        self._whole_runs = self._make_runs(self._session)
         self.reset()
 
     @property
     def input_size(self) -> int:
-        """The length of `obs`."""
+        """Length of `obs`."""
         return int(self._session.get_inputs()[0].shape[-1])
 
     def reset(self) -> None:
-        """Forget everything seen so far."""
-        self._turn, self._next = 0, self._whole
+        """Clear the memory."""
+        self._memory_index, self._next_runs = 0, self._whole_runs
         for memory in self._memories[0]:
             memory[:] = 0.0
 
     def prepare(self) -> None:
-        """Do of the next step what needs no observation, if the network has such a part; `step` then takes less time.
+        """Compute the part of the next step that needs no observation; `step` is then faster.
 
-        May be left out. The first call, which cuts the network in two, is slow.
+        Optional. The first call is slow: it splits the network.
         """
-        if self._halves is not None:
-            ahead, self._next = self._halves
-            ahead[self._turn]()
+        if self._split_runs is not None:
+            ahead, self._next_runs = self._split_runs
+            ahead[self._memory_index]()
 
     def step(self, observation: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-        """One time step: `obs` (n,) to the outputs, each (m,).
+        """Compute one time step.
 
-        Raises FloatingPointError where an output is not finite; the memory then is of no use until `reset`.
+        Args:
+            observation: Input `obs`, (n,).
+
+        Returns:
+            Outputs, (m,) each.
+
+        Raises:
+            FloatingPointError: An output is not finite; the memory is invalid until `reset`.
         """
         self._input[0] = observation
-        self._next[self._turn]()
-        self._turn, self._next = 1 - self._turn, self._whole
+        self._next_runs[self._memory_index]()
+        self._memory_index, self._next_runs = 1 - self._memory_index, self._whole_runs
         result = self._result[0].copy()
-        outputs = [result[place] for place in self._places]
+        outputs = [result[place] for place in self._output_slices]
         if not all(map(math.isfinite, result.tolist())):  # for so few numbers quicker than NumPy
             named = zip(self._outputs, outputs, strict=True)
             broken = next(name for name, output in named if not np.isfinite(output).all())
@@ -128,30 +146,30 @@ class RecurrentNetwork:
         return outputs
 
     @cached_property
-    def _halves(self) -> tuple[list[_Run], list[_Run]] | None:
-        """What runs ahead of an observation and what runs on it, or None where the network has no such parts."""
-        models = ahead.cut(self._model, "obs")
+    def _split_runs(self) -> tuple[list[_BoundRun], list[_BoundRun]] | None:
+        """Runs before and after the observation; None if the network cannot be split."""
+        models = ahead.split_network(self._model, "obs")
         if models is None:
             return None
-        before, after = map(self._open, models)
+        before, after = map(self._open_session, models)
         handed_over = {end.name: np.zeros(end.shape, np.float32) for end in before.get_outputs()}
-        return self._runs(before, handed_over), self._runs(after, handed_over)
+        return self._make_runs(before, handed_over), self._make_runs(after, handed_over)
 
-    def _runs(
+    def _make_runs(
         self,
         session: onnxruntime.InferenceSession,
         handed_over: Mapping[str, NDArray[np.float32]] = MappingProxyType({}),
-    ) -> list[_Run]:
-        """A run for each turn of the memories."""
+    ) -> list[_BoundRun]:
+        """Return a run for each of the two alternating memories."""
         return [
-            _Run(
+            _BoundRun(
                 session,
                 {
                     "obs": self._input,
                     **dict(zip((*MEMORY_INPUTS, *MEMORY_OUTPUTS), (*read, *write), strict=True)),
                     **{
                         name: self._result[:, place]
-                        for name, place in zip(self._outputs, self._places, strict=True)
+                        for name, place in zip(self._outputs, self._output_slices, strict=True)
                     },
                     **handed_over,
                 },
@@ -159,12 +177,21 @@ class RecurrentNetwork:
             for read, write in (self._memories, self._memories[::-1])
         ]
 
-    def refuse(self, what: str, found: object, expected: object) -> NetworkFileError:
-        """The error for a file of which `what` is `found`, for the caller to raise."""
+    def mismatch_error(self, what: str, found: object, expected: object) -> NetworkFileError:
+        """Return the error for a property of the file, for the caller to raise.
+
+        Args:
+            what: The property.
+            found: Its value.
+            expected: Expected value.
+
+        Returns:
+            The error.
+        """
         return NetworkFileError(f"{self.path}: {what} is {found!r}, expected {expected!r}")
 
-    def _try_out(self) -> None:
-        """One run on zeros: shows the true shapes of the outputs, and is the slow first run of the session."""
+    def _run_on_zeros(self) -> None:
+        """Run on zeros once: checks the shapes of the outputs and takes the slow first run."""
         memory = self.metadata["state_shape"]
         zeros = {name: np.zeros(memory, np.float32) for name in MEMORY_INPUTS}
         inputs = {"obs": np.zeros((1, self.input_size), np.float32), **zeros}
@@ -182,14 +209,15 @@ class RecurrentNetwork:
                 raise NetworkFileError(f"{self.path}: output {name} is not finite for an input of zeros")
 
     def _require(self, what: str, found: object, expected: object) -> None:
+        """Raise the mismatch error if values differ."""
         if found != expected:
-            raise self.refuse(what, found, expected)
+            raise self.mismatch_error(what, found, expected)
 
-    def _open(self, model: ModelProto) -> onnxruntime.InferenceSession:
-        """The network, or a part of it, ready to run."""
+    def _open_session(self, model: ModelProto) -> onnxruntime.InferenceSession:
+        """Return a session of the network or of a part of it."""
         try:
             return onnxruntime.InferenceSession(
-                model.SerializeToString(), _options(), providers=["CPUExecutionProvider"]
+                model.SerializeToString(), _session_options(), providers=["CPUExecutionProvider"]
             )
         except Exception as error:  # onnxruntime's exceptions share no other base
             raise NetworkFileError(
@@ -197,6 +225,7 @@ class RecurrentNetwork:
             ) from error
 
     def _read_metadata(self, fields: Sequence[str]) -> dict[str, Any]:
+        """Return the metadata and check that the fields exist."""
         text = self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
         if text is None:
             raise NetworkFileError(
@@ -216,6 +245,7 @@ class RecurrentNetwork:
         return metadata
 
     def _check_signature(self) -> None:
+        """Check names, types and shapes of inputs and outputs."""
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         self._require("list of inputs", [i.name for i in inputs], ["obs", *MEMORY_INPUTS])
         self._require("list of outputs", [o.name for o in outputs], [*self._outputs, *MEMORY_OUTPUTS])
@@ -224,8 +254,10 @@ class RecurrentNetwork:
             self._require(f"shape of input {memory.name}", memory.shape, self.metadata["state_shape"])
         for end in inputs:
             lengths = [length for length in end.shape if isinstance(length, int) and length > 0]
-            if len(lengths) < len(end.shape) or math.prod(lengths) > LONGEST:
-                raise self.refuse(f"shape of input {end.name}", end.shape, f"at most {LONGEST} numbers")
+            if len(lengths) < len(end.shape) or math.prod(lengths) > MAX_INPUT_LENGTH:
+                raise self.mismatch_error(
+                    f"shape of input {end.name}", end.shape, f"at most {MAX_INPUT_LENGTH} numbers"
+                )
         shape = inputs[0].shape
         if len(shape) != 2 or shape[0] != 1:
-            raise self.refuse("shape of input obs", shape, [1, "n"])
+            raise self.mismatch_error("shape of input obs", shape, [1, "n"])

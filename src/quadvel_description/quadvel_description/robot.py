@@ -1,8 +1,9 @@
-"""The AlienGo in numbers: joints, limits, postures, link inertials. Everything else is derived from this table.
+"""Numbers of the AlienGo: joints, limits, postures, inertias; all models derive from them.
 
-Source of kinematics and inertials: Unitree's `aliengo_description` (xacro of November 2022, BSD-3), inertias about each
-link's own centre of mass. Limits of commands: Unitree's SDK (`aliengo_const.h`). Armature and joint friction: rounded
-mean of the two public identifications of a real AlienGo by IIT's DLS lab (chirps with the robot hung).
+Sources. Kinematics and inertias: Unitree's `aliengo_description` (xacro of November 2022, BSD-3),
+inertias about each link's centre of mass. Command limits: Unitree's SDK (`aliengo_const.h`).
+Armature and joint friction: rounded mean of the two public identifications of a real, suspended
+AlienGo by IIT's DLS lab (chirps).
 """
 
 from __future__ import annotations
@@ -31,20 +32,24 @@ GRAVITY = 9.81  # m/s^2
 
 
 def _per_leg(hip: float, thigh: float, calf: float) -> np.ndarray:
-    """The same three values for every leg, (12,), read-only."""
+    """Return the same three values for every leg, (12,), read-only."""
     values = np.tile([hip, thigh, calf], 4).astype(float)
     values.flags.writeable = False
     return values
 
 
 def _hip_range(inward: float, outward: float) -> tuple[list[float], list[float]]:
-    """Lower and upper hip limits a leg; positive hip angles move a left foot outward and a right foot inward."""
+    """Return lower and upper hip limits per leg.
+
+    Positive hip angles move a left foot outward and a right foot inward.
+    """
     lower = [-inward if LEFT[leg] > 0 else -outward for leg in LEGS]
     upper = [outward if LEFT[leg] > 0 else inward for leg in LEGS]
     return lower, upper
 
 
 def _with_hips(hips: list[float], thigh: float, calf: float) -> np.ndarray:
+    """Return joint values, (12,), read-only; hips differ, thighs and calves are equal."""
     values = np.array([angle for hip in hips for angle in (hip, thigh, calf)])
     values.flags.writeable = False
     return values
@@ -54,12 +59,12 @@ NOMINAL_Q = _per_leg(0.0, 0.6435, -1.287)  # rad, stance: feet 0.4 m below the h
 LIE_Q = _per_leg(0.0, 1.343, -2.696)  # rad
 NOMINAL_HEIGHT = 0.4265  # m, trunk above ground in NOMINAL_Q
 LIE_HEIGHT = 0.137  # m
-HUNG_HEIGHT = 1.0  # m, trunk of a robot that is held in the air
+SUSPENDED_HEIGHT = 1.0  # m, trunk above ground if the robot is held in the air
 
 # mechanical range
 LOWER = _per_leg(-1.2217305, -2.0943951, -2.7750735)
 UPPER = _per_leg(1.2217305, 4.1887902, -0.6457718)
-# range that commands are held to: the intersection of the mechanical range and the SDK's own limits
+# command range: intersection of the mechanical range and the limits of the SDK
 _HIP_LOWER, _HIP_UPPER = _hip_range(inward=0.873, outward=1.047)
 COMMAND_LOWER = _with_hips(_HIP_LOWER, -0.524, -2.775)
 COMMAND_UPPER = _with_hips(_HIP_UPPER, 3.927, -0.646)
@@ -76,25 +81,50 @@ IMU_POSITION = (0.0, 0.0, 0.0)  # in the trunk frame
 
 @attrs.frozen
 class Inertial:
-    """A rigid body's inertia: mass (kg), centre of mass (3,) in m, tensor (3, 3) about it in kg m^2, link axes."""
+    """Inertia of a rigid body.
+
+    Attributes:
+        mass: Mass, kg.
+        com: Centre of mass, (3,), m, link frame.
+        tensor: Inertia tensor about the centre of mass, (3, 3), kg m^2, link axes.
+    """
 
     mass: float
     com: np.ndarray
     tensor: np.ndarray
 
-    def moved(self, offset: Sequence[float]) -> Inertial:
-        """The same body seen from a frame in which this link's origin lies at `offset`."""
+    def translated(self, offset: Sequence[float]) -> Inertial:
+        """Return the same body in a frame in which the link's origin lies at an offset.
+
+        Args:
+            offset: Position of the link's origin, (3,), m.
+
+        Returns:
+            The inertia in that frame.
+        """
         return attrs.evolve(self, com=self.com + np.asarray(offset, float))
 
-    def full(self) -> list[float]:
-        """[ixx, iyy, izz, ixy, ixz, iyz], MuJoCo's `fullinertia`."""
+    def fullinertia(self) -> list[float]:
+        """Return the tensor as MuJoCo's `fullinertia`.
+
+        Returns:
+            [ixx, iyy, izz, ixy, ixz, iyz], kg m^2.
+        """
         t = self.tensor
         return [t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2]]
 
 
-def lump(parts: Iterable[Inertial]) -> Inertial:
-    """One rigid body made of several in a common frame (parallel-axis theorem)."""
+def combine_inertials(parts: Iterable[Inertial]) -> Inertial:
+    """Combine rigid bodies that are fixed to each other.
+
+    Args:
+        parts: Inertias in a common frame.
+
+    Returns:
+        Inertia of the combined body.
+    """
     parts = list(parts)
+    # Parallel-axis theorem: I = sum of I_i + m_i (d.d 1 - d d^T), d from the common centre of mass.
     mass = sum(p.mass for p in parts)
     com = sum((p.mass * p.com for p in parts), np.zeros(3)) / mass
     tensor = np.zeros((3, 3))
@@ -105,6 +135,7 @@ def lump(parts: Iterable[Inertial]) -> Inertial:
 
 
 def _inertial(mass: float, com: Sequence[float], full: Sequence[float]) -> Inertial:
+    """Return an inertia from MuJoCo's `fullinertia` order."""
     ixx, iyy, izz, ixy, ixz, iyz = full
     return Inertial(mass, np.array(com), np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]))
 
@@ -128,7 +159,15 @@ _CALF_ROTOR = _inertial(0.132, (0, 0, 0), (0.000145463, 0.000133031, 0.000145463
 
 @attrs.frozen
 class Link:
-    """One link: its parent, the joint's axis (None: fixed), the joint's origin in the parent frame (m), its inertial."""
+    """A link of the robot.
+
+    Attributes:
+        name: Name of the link.
+        parent: Name of its parent; None for the trunk.
+        axis: Axis of its joint, `x` or `y`; None: fixed.
+        origin: Origin of the joint in the parent frame, (3,), m.
+        inertial: Inertia of the link.
+    """
 
     name: str
     parent: str | None
@@ -138,6 +177,7 @@ class Link:
 
 
 def _leg_links(leg: str) -> list[Link]:
+    """Return the links of a leg."""
     sx, sy = FRONT[leg], LEFT[leg]
     hip = _inertial(
         1.993,
@@ -169,17 +209,31 @@ LINKS: tuple[Link, ...] = (
 MASS = sum(link.inertial.mass for link in LINKS)  # kg
 
 
-def lumped(name: str) -> Inertial:
-    """Inertial of a moving link together with what is fixed to it, in that link's frame."""
+def combined_inertial(name: str) -> Inertial:
+    """Return the inertia of a moving link together with everything that is fixed to it.
+
+    Args:
+        name: Name of the link.
+
+    Returns:
+        Inertia in the link's frame.
+    """
     own = next(link for link in LINKS if link.name == name)
     fixed = [link for link in LINKS if link.parent == name and link.axis is None]
-    return lump([own.inertial, *(link.inertial.moved(link.origin) for link in fixed)])
+    return combine_inertials([own.inertial, *(link.inertial.translated(link.origin) for link in fixed)])
 
 
 def joint_index(names: Sequence[str]) -> list[int]:
-    """Where each of `names` (with or without `_joint`) stands in JOINT_NAMES.
+    """Find joints in JOINT_NAMES.
 
-    Raises ValueError that names the first unknown joint.
+    Args:
+        names: Joint names, with or without `_joint`.
+
+    Returns:
+        Index of each joint.
+
+    Raises:
+        ValueError: A name is unknown; the message names it.
     """
     index = {name: i for i, name in enumerate(JOINT_NAMES)}
     found = []

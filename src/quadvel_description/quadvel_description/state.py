@@ -1,4 +1,4 @@
-"""Plain records that cross package borders: what the robot reports and what its joints are asked for. No ROS."""
+"""Records that packages exchange: state of the robot and command to its joints. No ROS."""
 
 from __future__ import annotations
 
@@ -13,41 +13,79 @@ _zeros = attrs.Factory(lambda: np.zeros(12))
 
 @attrs.define
 class RobotState:
-    """One sample of the robot; every quantity held at `time`. Joint order as in `robot.JOINT_NAMES`."""
+    """State of the robot at `time`. Joint order as in `robot.JOINT_NAMES`.
 
-    time: float  # s
-    tick: int  # ms, wraps at 2^32
-    q: np.ndarray  # (12,) rad
-    dq: np.ndarray  # (12,) rad/s
-    tau: np.ndarray  # (12,) N m, the drives' own estimate
-    quaternion: np.ndarray  # (4,) w, x, y, z, body to world
-    angular_velocity: np.ndarray  # (3,) rad/s, body frame
-    linear_acceleration: np.ndarray  # (3,) m/s^2, body frame, +9.81 in z at rest
-    foot_force: np.ndarray  # (4,) N
+    Attributes:
+        time: Time of the sample, s.
+        tick: The same in ms as a counter; wraps at 2^32.
+        q: Joint positions, (12,), rad.
+        dq: Joint velocities, (12,), rad/s.
+        tau: Joint torques that the drives estimate, (12,), N m.
+        quaternion: Orientation, body to world, (4,), (w, x, y, z).
+        angular_velocity: Gyroscope in the body frame, (3,), rad/s.
+        linear_acceleration: Accelerometer in the body frame, (3,), m/s^2; +9.81 in z at rest.
+        foot_force: Normal force at each foot, (4,), N.
+    """
+
+    time: float
+    tick: int
+    q: np.ndarray
+    dq: np.ndarray
+    tau: np.ndarray
+    quaternion: np.ndarray
+    angular_velocity: np.ndarray
+    linear_acceleration: np.ndarray
+    foot_force: np.ndarray
 
 
 @attrs.define
 class JointCommand:
-    """What the drives are asked for: torque = tau + kp (q - q_measured) + kd (dq - dq_measured)."""
+    """Joint command: torque = tau + kp (q - q_measured) + kd (dq - dq_measured).
 
-    q: np.ndarray = _zeros  # (12,) rad
-    dq: np.ndarray = _zeros  # (12,) rad/s
-    tau: np.ndarray = _zeros  # (12,) N m
-    kp: np.ndarray = _zeros  # (12,) N m/rad
-    kd: np.ndarray = _zeros  # (12,) N m s/rad
+    Attributes:
+        q: Target positions, (12,), rad.
+        dq: Target velocities, (12,), rad/s.
+        tau: Feed-forward torques, (12,), N m.
+        kp: Proportional gains, (12,), N m/rad.
+        kd: Damping gains, (12,), N m s/rad.
+        mode: MODE_SERVO, or MODE_DAMPING in which the drives ignore `kp` and `tau`.
+        tick: Tick of the state that this command answers.
+    """
+
+    q: np.ndarray = _zeros
+    dq: np.ndarray = _zeros
+    tau: np.ndarray = _zeros
+    kp: np.ndarray = _zeros
+    kd: np.ndarray = _zeros
     mode: int = MODE_SERVO
-    tick: int = 0  # tick of the state that this answers
+    tick: int = 0
 
     @property
     def target(self) -> np.ndarray:
-        """The angles (12,) rad at which the drives would push as little as without a target: q + tau / kp."""
+        """Equilibrium positions of the command without damping, q + tau / kp, (12,), rad."""
         return self.q + np.divide(self.tau, self.kp, out=np.zeros_like(self.q), where=self.kp > 0)
 
     def torque(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-        """The torque (12,) N m that is asked for where the joints are: q (12,) rad, dq (12,) rad/s."""
+        """Compute the commanded torque at a joint state.
+
+        Args:
+            q: Joint positions, (12,), rad.
+            dq: Joint velocities, (12,), rad/s.
+
+        Returns:
+            Torques, (12,), N m.
+        """
         return self.tau + self.kp * (self.q - q) + self.kd * (self.dq - dq)
 
     @classmethod
     def damping(cls, kd: float = 5.0, tick: int = 0) -> JointCommand:
-        """Brake every joint."""
+        """Create a command that brakes every joint.
+
+        Args:
+            kd: Damping gain, N m s/rad.
+            tick: Tick of the state that this command answers.
+
+        Returns:
+            The command.
+        """
         return cls(kd=np.full(12, kd), mode=MODE_DAMPING, tick=tick)

@@ -1,6 +1,7 @@
-"""Table 1 of the paper: what the robot's mirror image (across its sagittal plane) sees and does.
+"""Left-right symmetry of the robot: mirror image across its sagittal plane (Table 1 of the paper).
 
-Extended to the command (cx, -cy, -cr, cs) and the previous action. A mirror is a signed permutation of the last axis.
+Extended to the command (cx, -cy, -cr, cs) and the previous action. A mirror is a signed permutation
+of the last axis.
 """
 
 from __future__ import annotations
@@ -13,20 +14,31 @@ _LEG_SWAP = (1, 0, 3, 2)  # FR <-> FL, RR <-> RL
 
 @attrs.frozen(eq=False)
 class Mirror:
-    """y = sign * x[..., index]; its own inverse."""
+    """Signed permutation y = sign * x[..., index]; its own inverse.
+
+    Attributes:
+        index: Permutation, (n,).
+        sign: Signs, (n,).
+    """
 
     index: np.ndarray
     sign: np.ndarray
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Return the mirror image of `x`, (..., n)."""
         return x[..., self.index] * self.sign
 
     def matrix(self) -> np.ndarray:
-        """M with mirrored = M x, (n, n)."""
+        """Return the mirror as a matrix.
+
+        Returns:
+            M with mirrored = M x, (n, n).
+        """
         return np.eye(len(self.index))[self.index] * self.sign[:, None]
 
 
 def _signs(*signs: float) -> Mirror:
+    """Return a mirror that changes signs only."""
     return Mirror(np.arange(len(signs)), np.array(signs, float))
 
 
@@ -44,8 +56,15 @@ PARTS = {
 """Mirror of each part of an observation, by the part's name in the policy file."""
 
 
-def stack(parts: list[Mirror]) -> Mirror:
-    """Mirror of the concatenation of several parts."""
+def concatenate_mirrors(parts: list[Mirror]) -> Mirror:
+    """Create the mirror of a concatenation.
+
+    Args:
+        parts: Mirrors of the parts.
+
+    Returns:
+        Mirror of the concatenated parts.
+    """
     starts = np.cumsum([0] + [len(p.index) for p in parts[:-1]])
     return Mirror(
         np.concatenate([p.index + s for p, s in zip(parts, starts, strict=True)]),
@@ -53,16 +72,30 @@ def stack(parts: list[Mirror]) -> Mirror:
     )
 
 
-OBSERVATION = stack(list(PARTS.values()))
+OBSERVATION = concatenate_mirrors(list(PARTS.values()))
 
 
 def mirror_observation(observation: np.ndarray) -> np.ndarray:
-    """The paper's 48-vector as the mirrored robot sees it, (..., 48)."""
+    """Mirror an observation.
+
+    Args:
+        observation: The paper's observation, (..., 48).
+
+    Returns:
+        Observation of the mirrored robot, (..., 48).
+    """
     return OBSERVATION(observation)
 
 
 def mirror_joints(x: np.ndarray) -> np.ndarray:
-    """Joint quantities of the mirrored robot, (..., 12)."""
+    """Mirror joint quantities.
+
+    Args:
+        x: Joint positions, velocities, torques or actions, (..., 12).
+
+    Returns:
+        Those of the mirrored robot, (..., 12).
+    """
     return JOINTS(x)
 
 

@@ -1,6 +1,6 @@
-"""The AlienGo as a URDF for RViz, Foxglove and MoveIt; `python -m quadvel_description.urdf` prints it.
+"""URDF of the AlienGo for RViz, Foxglove, MoveIt; `python -m quadvel_description.urdf` prints it.
 
-Links, inertials and limits come from `robot`, shapes from the MJCF. Simulation uses the MJCF, not this.
+Links, inertias and limits come from `robot`, shapes from the MJCF. The simulation uses the MJCF.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from .mjcf import Plant, load_model
 
 
 def _text(*values: float) -> str:
+    """Return numbers as an attribute value."""
     return " ".join(repr(float(value) + 0.0) for value in values)  # + 0.0: no negative zeros
 
 
 def _rpy(quaternion: np.ndarray) -> np.ndarray:
-    """Roll, pitch, yaw (rad) of a quaternion wxyz, URDF's fixed-axis angles."""
+    """Return roll, pitch, yaw (rad) of a quaternion (w, x, y, z): URDF's fixed-axis angles."""
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
     r = matrix.reshape(3, 3)
@@ -29,16 +30,17 @@ def _rpy(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _add_inertial(element: ElementTree.Element, inertial: robot.Inertial) -> None:
+    """Add the inertia of a link."""
     node = ElementTree.SubElement(element, "inertial")
     ElementTree.SubElement(node, "origin", xyz=_text(*inertial.com), rpy="0 0 0")
     ElementTree.SubElement(node, "mass", value=_text(inertial.mass))
     names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-    tensor = {name: _text(value) for name, value in zip(names, inertial.full(), strict=True)}
+    tensor = {name: _text(value) for name, value in zip(names, inertial.fullinertia(), strict=True)}
     ElementTree.SubElement(node, "inertia", tensor)
 
 
 def _add_shape(element: ElementTree.Element, model: mujoco.MjModel, geom: int, origin: np.ndarray) -> None:
-    """The MJCF shape `geom` as visual and collision of a link that lies at `origin` in the geom's body."""
+    """Add an MJCF geom as visual and collision of a link at `origin` in the geom's body."""
     size = model.geom_size[geom]
     shape: tuple[str, dict[str, str]]
     match int(model.geom_type[geom]):
@@ -64,19 +66,18 @@ def _add_shape(element: ElementTree.Element, model: mujoco.MjModel, geom: int, o
 
 
 def _add_link(parent: ElementTree.Element, link: robot.Link, model: mujoco.MjModel) -> None:
+    """Add a link with inertia and shapes."""
     element = ElementTree.SubElement(parent, "link", name=link.name)
     _add_inertial(element, link.inertial)
     for geom in range(model.ngeom):
         body = model.body(model.geom_bodyid[geom]).name
-        owner = (
-            model.geom(geom).name or body
-        )  # a foot is a link of its own here, and a named geom of the calf there
+        owner = model.geom(geom).name or body  # a foot is a link here, and a geom of the calf there
         if owner == link.name:
             _add_shape(element, model, geom, np.zeros(3) if body == owner else np.array(link.origin))
 
 
 def _add_joint(parent: ElementTree.Element, link: robot.Link) -> None:
-    """What holds `link` to its parent: a joint of the joint table, or a fixed one."""
+    """Add the joint between `link` and its parent: revolute (joint table) or fixed."""
     name = f"{link.name}_joint" if link.axis else f"{link.name}_fixed"
     element = ElementTree.SubElement(parent, "joint", name=name, type="revolute" if link.axis else "fixed")
     ElementTree.SubElement(element, "parent", link=link.parent or BASE)
@@ -99,7 +100,11 @@ def _add_joint(parent: ElementTree.Element, link: robot.Link) -> None:
 
 
 def urdf() -> str:
-    """The URDF as text: root link `base_link`, the trunk fixed to it, joints named as in `robot.JOINT_NAMES`."""
+    """Create the URDF: root link `base_link` with the trunk; joints as in `robot.JOINT_NAMES`.
+
+    Returns:
+        URDF text.
+    """
     model = load_model(Plant(plane=False))
     root = ElementTree.Element("robot", name="aliengo")
     ElementTree.SubElement(root, "link", name=BASE)

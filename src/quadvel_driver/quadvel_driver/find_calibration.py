@@ -156,7 +156,7 @@ def _leg_masses(q: Array, leg: str) -> tuple[tuple[list[Array], list[Array]], li
     joints, centres, axes, masses = [], [], [], []
     for k, kind in enumerate(robot.KINDS):
         link = next(link for link in robot.LINKS if link.name == f"{leg}_{kind}")
-        body = robot.lumped(link.name)
+        body = robot.combined_inertial(link.name)
         position = position + rotation @ np.array(link.origin)
         rotation = rotation @ _rotation_about(q[:, k], 0 if link.axis == "x" else 1)
         joints.append(position)

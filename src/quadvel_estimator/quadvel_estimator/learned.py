@@ -44,7 +44,9 @@ class LearnedEstimator:
         self._expect("length of input obs", self._network.input_size, self._layout.size)
         self._scale = metadata["output_scale"]
         if not isinstance(self._scale, int | float) or not 0.0 < self._scale < float("inf"):
-            raise self._network.refuse("metadata field output_scale", self._scale, "a positive number")
+            raise self._network.mismatch_error(
+                "metadata field output_scale", self._scale, "a positive number"
+            )
 
     def reset(self) -> None:
         """Reset the recurrent state of the network."""
@@ -74,4 +76,4 @@ class LearnedEstimator:
 
     def _expect(self, what: str, found: object, expected: object) -> None:
         if found != expected:
-            raise self._network.refuse(what, found, expected)
+            raise self._network.mismatch_error(what, found, expected)

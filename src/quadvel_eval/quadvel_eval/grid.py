@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_sim.physics import SECOND
+from quadvel_sim.physics import HELD_OUT_PHYSICS
 
 from .pool import Call, run_in_parallel
 from .robot_loop import CONTROL_PERIOD_S, RobotLoop
@@ -36,7 +36,7 @@ MIN_SPEED_FOR_DELAY, MIN_YAW_RATE_FOR_DELAY = (
     0.2,
     0.3,
 )  # m/s, rad/s: for slower commands the delay is undefined
-PLANTS: dict[str, Mapping[str, Any]] = {"usual": {}, "second": {"physics": SECOND}}
+PLANTS: dict[str, Mapping[str, Any]] = {"usual": {}, "second": {"physics": HELD_OUT_PHYSICS}}
 """Plants of the evaluation, as fields of `SimulatorConfig`; the second one solves contacts differently."""
 
 

@@ -318,7 +318,7 @@ def _stretch_errors(
 ) -> Array:
     """Mean square errors of q, dq and torque over the joints, (n, 3), one row per ms from `row` on."""
     past = [(joints.q[i], joints.dq[i], _command_at(joints, i)) for i in range(row - HISTORY_MS, row)]
-    simulator.place(truth(joints.time[row]), joints.q[row], joints.dq[row], past)
+    simulator.set_state(truth(joints.time[row]), joints.q[row], joints.dq[row], past)
     squares = np.empty((round(STRETCH_DURATION_S / DT), 3))
     for i, square in enumerate(squares, start=row):
         simulator.command(_command_at(joints, i))

@@ -14,7 +14,7 @@ from matplotlib.patches import Circle, Rectangle
 from numpy.typing import ArrayLike
 from rich.console import Console
 
-from quadvel_sim.world import SHIPPED, World
+from quadvel_sim.world import SHIPPED_WORLDS, World
 
 from .output import output_file
 from .report import write_figure
@@ -26,7 +26,7 @@ LEADER_COLOUR, OTHER_COLOUR = "#1a9641", "#4575b4"
 
 
 def world_command(
-    world: Annotated[str, typer.Argument(help=f"{', '.join(SHIPPED)} or a YAML file.")],
+    world: Annotated[str, typer.Argument(help=f"{', '.join(SHIPPED_WORLDS)} or a YAML file.")],
     out: Annotated[
         Path | None,
         typer.Option(

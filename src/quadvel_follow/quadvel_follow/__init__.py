@@ -1,4 +1,4 @@
-"""Persons in laser scans: finding their legs, and tracking them."""
+"""Person following: leg detection in laser scans, tracking, and planning of velocities."""
 
 from .leg_detector import LegDetector
 from .person_tracker import PersonTracker, Track, TrackerConfig

@@ -1,7 +1,4 @@
-"""From a scan to the things that it shows, and what a classifier is given of each.
-
-It knows nothing of networks, tracks or ROS. All things of a scan are worked on at once.
-"""
+"""Segmentation of a laser scan into clusters, and their features for the leg classifier."""
 
 from __future__ import annotations
 
@@ -12,23 +9,34 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-NEAREST = 0.02  # m, below it a reading is a scanner's way to say that there was none
-JUMP = 0.13  # m, from one thing to the next, at least
-JUMP_SPACINGS = 1.6  # the same in distances between neighbouring rays, where these are further apart
-LOST_RAYS = 3  # rays without a reading that do not part a thing
-WINDOW = np.linspace(-0.6, 0.6, 49)  # m to the side of a thing, where the classifier looks
-DEPTH = 0.5  # m before and behind a thing, as far as the classifier looks
-LEG = 0.12  # m, across a leg, the measure of widths
-WIDEST = 0.5  # m, of two legs beside each other
-NUMBERS = WINDOW.size + 4
+MIN_RANGE_M = 0.02
+"""A smaller range means that there was no echo."""
+MIN_GAP_M = 0.13
+"""Smallest distance between two clusters."""
+MIN_GAP_SPACINGS = 1.6
+"""The same in ray spacings; the larger of both counts."""
+MAX_LOST_RAYS = 3
+"""Number of rays without an echo that do not split a cluster."""
+WINDOW_OFFSETS_M = np.linspace(-0.6, 0.6, 49)
+"""Lateral positions of the classifier's window."""
+WINDOW_DEPTH_M = 0.5
+"""Depth of the classifier's window before and behind the centre."""
+LEG_WIDTH_M = 0.12
+"""Typical width of a leg; scales widths and spacings."""
+MAX_CLUSTER_WIDTH_M = 0.5
+"""Width of two legs next to each other."""
+FEATURE_COUNT = WINDOW_OFFSETS_M.size + 4
 
 
 @attrs.frozen
 class Clusters:
-    """The K things that a scan shows, in the order of its rays.
+    """The K clusters of a scan in the order of its rays.
 
-    centre (K, 2): m, mean of the readings, sensor frame; count (K,): how many readings it has;
-    spacing (K,): m between neighbouring rays at its distance; width (K,): m, from its first reading to its last.
+    Attributes:
+        centre: Mean of the readings in the sensor frame, (K, 2), m.
+        count: Number of readings, (K,).
+        spacing: Distance between neighbouring rays at the cluster, (K,), m.
+        width: Distance from the first to the last reading, (K,), m.
     """
 
     centre: Array
@@ -39,15 +47,33 @@ class Clusters:
 
 @attrs.frozen
 class Scan:
-    """Readings in the order of growing angle: range (N,) in m, inf where there is none; the first angle and the step, rad."""
+    """Laser scan in the order of increasing angle.
+
+    Attributes:
+        ranges: Ranges, (N,), m; inf for a ray without an echo.
+        angle_min: Angle of the first ray, rad.
+        angle_increment: Angle between two rays, rad.
+    """
 
     ranges: Array
     angle_min: float
     angle_increment: float
 
     @classmethod
-    def checked(cls, ranges: ArrayLike, angle_min: float, angle_increment: float) -> Scan:
-        """A scan as a scanner gives it. Raises ValueError, with the field, what it is and what was expected."""
+    def validated(cls, ranges: ArrayLike, angle_min: float, angle_increment: float) -> Scan:
+        """Create a scan from the raw values of a scanner.
+
+        Args:
+            ranges: Ranges, (rays,), m; NaN, infinite and very small ones are rays without an echo.
+            angle_min: Angle of the first ray, rad.
+            angle_increment: Angle between two rays, rad; a negative one reverses the order.
+
+        Returns:
+            The scan.
+
+        Raises:
+            ValueError: A value is malformed; the message names field, value and expectation.
+        """
         try:
             found = np.array(ranges, dtype=float)
         except (TypeError, ValueError):
@@ -65,34 +91,55 @@ class Scan:
         if angle_increment < 0.0:
             angle_min, angle_increment = angle_min + angle_increment * (found.size - 1), -angle_increment
             found = found[::-1]
-        found[~(np.isfinite(found) & (found > NEAREST))] = np.inf
+        found[~(np.isfinite(found) & (found > MIN_RANGE_M))] = np.inf
         return cls(found, float(angle_min), float(angle_increment))
 
     @property
-    def closed(self) -> bool:
-        """Whether the last ray is the first one's neighbour."""
+    def is_full_circle(self) -> bool:
+        """Whether the last ray is a neighbour of the first."""
         return bool((self.ranges.size + 0.5) * self.angle_increment > 2.0 * np.pi)
 
-    def at(self, angles: Array) -> Array:
-        """The readings nearest to these angles, m; inf where there is none, NaN beyond the scan's ends."""
+    def range_at(self, angles: Array) -> Array:
+        """Return the ranges of the rays nearest to given angles.
+
+        Args:
+            angles: Angles, any shape, rad.
+
+        Returns:
+            Ranges, m; inf without an echo, NaN outside the field of view.
+        """
         rays = np.rint((angles - self.angle_min) / self.angle_increment).astype(np.intp)
         rays %= round(2.0 * np.pi / self.angle_increment)
         inside = rays < self.ranges.size
         return np.where(inside, self.ranges[np.where(inside, rays, 0)], np.nan)
 
     def points(self, rays: Indices) -> Array:
-        """Where these rays end, (n, 2)."""
+        """Return the end points of rays.
+
+        Args:
+            rays: Indices of rays, (n,).
+
+        Returns:
+            Points in the sensor frame, (n, 2), m.
+        """
         angles = self.angle_min + self.angle_increment * rays
         return self.ranges[rays % self.ranges.size, None] * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
 def find_clusters(scan: Scan) -> Clusters:
-    """Cut a scan wherever two readings beside each other lie too far apart."""
+    """Split a scan wherever two neighbouring readings are too far apart.
+
+    Args:
+        scan: The scan.
+
+    Returns:
+        Its clusters.
+    """
     rays = np.flatnonzero(np.isfinite(scan.ranges))
     if rays.size == 0:
         return Clusters(np.zeros((0, 2)), np.zeros(0, np.intp), np.zeros(0), np.zeros(0))
-    parted = _parted(scan, rays)
-    if scan.closed and parted.any():  # begin at a cut, that the ends of the scan are none
+    parted = _starts_cluster(scan, rays)
+    if scan.is_full_circle and parted.any():  # begin at a cut, that the ends of the scan are none
         begin = int(np.argmax(parted))
         rays, parted = np.r_[rays[begin:], rays[:begin] + scan.ranges.size], np.roll(parted, -begin)
     parted[0] = True
@@ -102,33 +149,45 @@ def find_clusters(scan: Scan) -> Clusters:
     centre = np.add.reduceat(points, first) / count[:, None]
     width = np.hypot(*(points[first + count - 1] - points[first]).T)
     spacing = scan.angle_increment * np.hypot(*centre.T)
-    # Some scanners say that there was nothing by their greatest range, which many rays then have to the last digit.
+    # Some scanners report their largest range if there is no echo: many rays then share one range.
     greatest = reading == reading.max()
     real = (np.add.reduceat(greatest, first) < count) | (np.count_nonzero(greatest) == 1)
     return Clusters(centre[real], count[real], spacing[real], width[real])
 
 
-def _parted(scan: Scan, rays: Indices) -> NDArray[np.bool_]:
-    """Whether each reading belongs to another thing than the reading before it; before the first comes the last."""
+def _starts_cluster(scan: Scan, rays: Indices) -> NDArray[np.bool_]:
+    """Return whether each reading starts a cluster; the last reading precedes the first."""
     reading, points = scan.ranges[rays], scan.points(rays)
     skipped = (rays - np.roll(rays, 1)) % scan.ranges.size
     nearer = np.minimum(reading, np.roll(reading, 1))
-    allowed = np.maximum(JUMP, JUMP_SPACINGS * scan.angle_increment * nearer)
+    allowed = np.maximum(MIN_GAP_M, MIN_GAP_SPACINGS * scan.angle_increment * nearer)
     distance = np.hypot(*(points - np.roll(points, 1, axis=0)).T)
-    return (distance > allowed) | (skipped > 1 + LOST_RAYS)
+    return (distance > allowed) | (skipped > 1 + MAX_LOST_RAYS)
 
 
-def describe(scan: Scan, clusters: Clusters) -> NDArray[np.float32]:
-    """What the classifier is given of each thing, (K, NUMBERS): the scan around it, at a scale of metres.
+def cluster_features(scan: Scan, clusters: Clusters) -> NDArray[np.float32]:
+    """Compute the features of each cluster for the leg classifier.
 
-    A window slides over the scan, as wide at every distance (Beyer, Hermans, Leibe: "DROW", 2017), and shows how far
-    behind the thing's centre each reading lies, from -1 to 1, 1 where there is none. Then distance, spacing of rays,
-    number of readings and width.
+    A window of constant width in metres slides over the scan (Beyer, Hermans, Leibe: DROW, 2017).
+    It shows how far behind the cluster's centre each reading lies, from -1 to 1; 1 without an echo.
+    Distance, ray spacing, number of readings and width follow.
+
+    Args:
+        scan: The scan.
+        clusters: Its K clusters.
+
+    Returns:
+        Features, (K, FEATURE_COUNT).
     """
     distance = np.hypot(*clusters.centre.T)
     bearing = np.arctan2(clusters.centre[:, 1], clusters.centre[:, 0])
-    angle = bearing[:, None] + np.arctan2(WINDOW, distance[:, None])
-    reading = np.nan_to_num(scan.at(angle), nan=np.inf, posinf=np.inf)
-    depth = np.clip((reading - distance[:, None]) / DEPTH, -1.0, 1.0)
-    scalars = [np.log1p(distance), clusters.spacing / LEG, np.log(clusters.count), clusters.width / LEG]
+    angle = bearing[:, None] + np.arctan2(WINDOW_OFFSETS_M, distance[:, None])
+    reading = np.nan_to_num(scan.range_at(angle), nan=np.inf, posinf=np.inf)
+    depth = np.clip((reading - distance[:, None]) / WINDOW_DEPTH_M, -1.0, 1.0)
+    scalars = [
+        np.log1p(distance),
+        clusters.spacing / LEG_WIDTH_M,
+        np.log(clusters.count),
+        clusters.width / LEG_WIDTH_M,
+    ]
     return np.column_stack([depth, *scalars]).astype(np.float32)

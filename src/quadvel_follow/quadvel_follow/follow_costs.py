@@ -1,4 +1,4 @@
-"""What a robot that follows a person would rather do: what each of many rollouts costs. No ROS, no search."""
+"""Cost of rollouts of a robot that follows a person. No ROS, no search."""
 
 from __future__ import annotations
 
@@ -8,30 +8,47 @@ from numpy.typing import NDArray
 
 from .clearance import Clearance, outline_distance
 from .clusters import Scan
-from .looking import to_sensor
-from .rollouts import TIMES, Limits, Rollouts
+from .free_space import to_sensor
+from .rollouts import TIMES_S, Limits, Rollouts
 
 Array = NDArray[np.float64]
 
-FADES = 2.0  # s, in which the velocity of the person who is followed is taken to fade, as it may stop; others walk on
-BODY = 0.25  # m, from the middle of a person to its outside
-SOFT = 0.3  # m, up to which an error of the distance counts by its square, and then by itself
-TURNS = 0.7  # m, from its place beside the person, up to which the robot turns as the person does
-CHANGES = np.array([3.0, 10.0, 15.0])  # cost of the squared change of vx, vy, wz from one step to the next
-USE = np.array([0.0, 2.0, 0.3])  # of their squares
-COLLISION = 1000.0
-CLOSE = 100.0  # 1/m^2, cost of the least distance to a person, as far as it is below what is kept
-KEPT, BERTH = 0.5, 0.7  # m, of the person who is followed, and of others, of whom one knows less
-GUARD = 0.05  # m, below which a clearance counts as a collision
+VELOCITY_FADE_S = 2.0
+"""Time constant with which the predicted velocity of the followed person fades."""
+PERSON_RADIUS_M = 0.25
+HUBER_WIDTH_M = 0.3
+"""Distance error up to which the cost is quadratic; beyond it is linear."""
+ALIGNMENT_DISTANCE_M = 0.7
+"""Distance to the place at the person's side below which the robot takes the person's heading."""
+CHANGE_WEIGHTS = np.array([3.0, 10.0, 15.0])
+"""Weights of squared changes of vx, vy (m/s), wz (rad/s) between steps."""
+EFFORT_WEIGHTS = np.array([0.0, 2.0, 0.3])
+"""Weights of squared vx, vy (m/s), wz (rad/s)."""
+COLLISION_COST = 1000.0
+CLOSENESS_WEIGHT = 100.0
+"""Weight (1/m^2) of the squared violation of the margin to a person."""
+FOLLOWED_MARGIN_M, PEDESTRIAN_MARGIN_M = 0.5, 0.7
+"""Margin to the followed person, and to other people, whose motion is less certain."""
+COLLISION_CLEARANCE_M = 0.05
+"""Clearance below which a rollout counts as a collision."""
 
 
 @attrs.frozen
 class Situation:
-    """All that is known at one instant, in the frame of the odometry.
+    """Everything known at one instant, in the odometry frame.
 
-    pose (3,): x, y (m), yaw (rad); velocity, command (3,): vx, vy (m/s), wz (rad/s), body frame; person (4,): x, y, vx, vy;
-    others (n, 4); goal (2,): m, the person or a place on the way to it; rest: m, from the goal to the person, 0 where the
-    goal is the person; sensor (3,): the scanner's pose at the scan.
+    Attributes:
+        pose: Pose of the robot, (3,): x, y in m, yaw in rad.
+        velocity: Velocity of the robot in the body frame, (3,): vx, vy in m/s, wz in rad/s.
+        command: Present command, as `velocity`.
+        person: Followed person, (4,): x, y in m, vx, vy in m/s.
+        others: Other people, (n, 4), as `person`.
+        goal: Followed person, or a point on the path to it, (2,), m.
+        remaining: Distance along the path from goal to person, m; 0 if the goal is the person.
+        clearance: Distances to obstacles.
+        scan: Newest scan.
+        sensor: Pose of the scanner at the scan, (3,): x, y in m, yaw in rad.
+        limits: Limits of the commands.
     """
 
     pose: Array
@@ -40,28 +57,43 @@ class Situation:
     person: Array
     others: Array
     goal: Array
-    rest: float
+    remaining: float
     clearance: Clearance
     scan: Scan
     sensor: Array
     limits: Limits
 
     @property
-    def direct(self) -> bool:
-        """Whether the goal is the person itself."""
-        return self.rest == 0.0
+    def is_direct(self) -> bool:
+        """Whether the goal is the person."""
+        return self.remaining == 0.0
 
 
 def predict_target(person: Array) -> Array:
-    """Where the person (4,) who is followed will be at `TIMES`, (STEPS, 2)."""
-    walked = FADES * (1.0 - np.exp(-TIMES / FADES))
+    """Predict the position of the followed person at `TIMES_S`.
+
+    The velocity fades, since the person may stop: p(t) = p + v T (1 - exp(-t / T)).
+
+    Args:
+        person: Position and velocity, (4,): x, y in m, vx, vy in m/s.
+
+    Returns:
+        Positions, (STEPS, 2), m.
+    """
+    walked = VELOCITY_FADE_S * (1.0 - np.exp(-TIMES_S / VELOCITY_FADE_S))
     return person[:2] + walked[:, None] * person[2:]
 
 
 @attrs.frozen
 class FollowCost:
-    """distance: m, from the person; side: 1 to its left, -1 to its right, 0 behind; margin: m, clearance that is kept;
-    length, width: m, of the robot.
+    """Weights and geometry of the cost.
+
+    Attributes:
+        distance: Desired distance to the person, m.
+        side: Desired side: 1 left of the person, -1 right, 0 behind.
+        margin: Desired clearance to obstacles, m.
+        length: Length of the robot's outline, m.
+        width: Width of the robot's outline, m.
     """
 
     distance: float
@@ -70,91 +102,136 @@ class FollowCost:
     length: float
     width: float
 
-    def of(self, situation: Situation, rollouts: Rollouts) -> Array:
-        """(K,), without unit."""
+    def evaluate(self, situation: Situation, rollouts: Rollouts) -> Array:
+        """Compute the cost of rollouts.
+
+        Args:
+            situation: Present situation.
+            rollouts: K rollouts.
+
+        Returns:
+            Costs, (K,), dimensionless.
+        """
         speed = np.hypot(rollouts.velocity[..., 0], rollouts.velocity[..., 1])
         return (
-            self._following(situation, rollouts)
-            + self._obstacles(situation.clearance.of(rollouts.poses), speed)
-            + self._persons(situation, rollouts, speed)
-            + self._unseen(situation, rollouts, speed)
-            + self._effort(situation, rollouts)
+            self._following_cost(situation, rollouts)
+            + self._obstacle_cost(situation.clearance.at_poses(rollouts.poses), speed)
+            + self._people_cost(situation, rollouts, speed)
+            + self._hidden_space_cost(situation, rollouts, speed)
+            + self._effort_cost(situation, rollouts)
         )
 
-    def errors(self, situation: Situation, poses: Array, person: Array) -> tuple[Array, Array]:
-        """Of the distance, m, too far above 0, and of the heading, rad, for poses (K, n, 3) and the person at (n, 2), m."""
-        if not situation.direct:
+    def tracking_errors(self, situation: Situation, poses: Array, person: Array) -> tuple[Array, Array]:
+        """Compute the errors of distance and heading.
+
+        Args:
+            situation: Present situation.
+            poses: Poses of the robot, (K, n, 3): x, y in m, yaw in rad.
+            person: Positions of the followed person, (n, 2), m.
+
+        Returns:
+            Distance error, (K, n), m, positive if too far; heading error, (K, n), rad.
+        """
+        if not situation.is_direct:
             off = situation.goal - poses[..., :2]
-            far = np.hypot(off[..., 0], off[..., 1]) + situation.rest - self.distance
-            return far, _wrapped(np.arctan2(off[..., 1], off[..., 0]) - poses[..., 2])
+            far = np.hypot(off[..., 0], off[..., 1]) + situation.remaining - self.distance
+            return far, _wrap_angle(np.arctan2(off[..., 1], off[..., 0]) - poses[..., 2])
         if not self.side:
             off = person - poses[..., :2]
             far = np.hypot(off[..., 0], off[..., 1]) - self.distance
-            return far, _wrapped(np.arctan2(off[..., 1], off[..., 0]) - poses[..., 2])
+            return far, _wrap_angle(np.arctan2(off[..., 1], off[..., 0]) - poses[..., 2])
         heading = np.arctan2(situation.person[3], situation.person[2])
-        off = person + self._beside(situation) - poses[..., :2]
+        off = person + self._side_offset(situation) - poses[..., :2]
         far = np.hypot(off[..., 0], off[..., 1])
-        wanted = np.where(far < TURNS, heading, np.arctan2(off[..., 1], off[..., 0]))
-        return far, _wrapped(wanted - poses[..., 2])
+        wanted = np.where(far < ALIGNMENT_DISTANCE_M, heading, np.arctan2(off[..., 1], off[..., 0]))
+        return far, _wrap_angle(wanted - poses[..., 2])
 
-    def _beside(self, situation: Situation) -> Array:
-        """From the person to the place beside it, (2,) m."""
+    def _side_offset(self, situation: Situation) -> Array:
+        """Return the vector from the person to the robot's place at its side, (2,), m."""
         heading = np.arctan2(situation.person[3], situation.person[2])
         return self.side * self.distance * np.array([-np.sin(heading), np.cos(heading)])
 
-    def place(self, situation: Situation) -> Array:
-        """Where to walk now, (2,) m: the goal, or the place beside the person."""
-        return situation.goal + self._beside(situation) if situation.direct else situation.goal
+    def target_point(self, situation: Situation) -> Array:
+        """Return the point to walk to: the goal, or the place at the person's side.
 
-    def _following(self, situation: Situation, rollouts: Rollouts) -> Array:
-        far, turn = self.errors(situation, rollouts.poses, predict_target(situation.person))
-        return (10.0 * (np.sqrt(far**2 + SOFT**2) - SOFT) + 6.0 * (1.0 - np.cos(turn))).mean(1)
+        Args:
+            situation: Present situation.
 
-    def _obstacles(self, clearance: Array, speed: Array) -> Array:
+        Returns:
+            Point, (2,), m.
+        """
+        return situation.goal + self._side_offset(situation) if situation.is_direct else situation.goal
+
+    def _following_cost(self, situation: Situation, rollouts: Rollouts) -> Array:
+        """Return the cost of errors of distance (pseudo-Huber) and heading."""
+        far, turn = self.tracking_errors(situation, rollouts.poses, predict_target(situation.person))
+        # Pseudo-Huber loss: sqrt(e^2 + w^2) - w.
+        return (
+            10.0 * (np.sqrt(far**2 + HUBER_WIDTH_M**2) - HUBER_WIDTH_M) + 6.0 * (1.0 - np.cos(turn))
+        ).mean(1)
+
+    def _obstacle_cost(self, clearance: Array, speed: Array) -> Array:
+        """Return the cost of obstacles: collision, too little clearance, speed near obstacles."""
         least = clearance.min(1)
         short = np.maximum(self.margin + 0.02 - least, 0.0)
         near = np.maximum(self.margin + 0.2 - clearance, 0.0)
         return (
-            COLLISION * (least < GUARD) + 200.0 * short**2 + (20.0 * near**2 + 1.5 * speed**2 * near).mean(1)
+            COLLISION_COST * (least < COLLISION_CLEARANCE_M)
+            + 200.0 * short**2
+            + (20.0 * near**2 + 1.5 * speed**2 * near).mean(1)
         )
 
-    def gaps(self, situation: Situation, poses: Array) -> Array:
-        """Between the outline at poses (K, STEPS, 3) and everybody, who is followed first, (persons, K, STEPS) in m."""
-        half = (0.5 * self.length, 0.5 * self.width)
-        others = situation.others[:, None, :2] + TIMES[:, None] * situation.others[:, None, 2:]
-        every = [predict_target(situation.person), *others]
-        return np.array([outline_distance(place, poses, half) - BODY for place in every])
+    def person_gaps(self, situation: Situation, poses: Array) -> Array:
+        """Compute the gap between the robot's outline and every person.
 
-    def _persons(self, situation: Situation, rollouts: Rollouts, speed: Array) -> Array:
-        """Nobody is met; past others, of whom one does not know where they go, the robot is slow."""
-        gaps = self.gaps(situation, rollouts.poses)
+        Args:
+            situation: Present situation.
+            poses: Poses of the robot, (K, STEPS, 3).
+
+        Returns:
+            Gaps, (persons, K, STEPS), m; the followed person first.
+        """
+        half = (0.5 * self.length, 0.5 * self.width)
+        others = situation.others[:, None, :2] + TIMES_S[:, None] * situation.others[:, None, 2:]
+        every = [predict_target(situation.person), *others]
+        return np.array([outline_distance(place, poses, half) - PERSON_RADIUS_M for place in every])
+
+    def _people_cost(self, situation: Situation, rollouts: Rollouts, speed: Array) -> Array:
+        """Return the cost of people: collision, too small a gap, speed near other people."""
+        gaps = self.person_gaps(situation, rollouts.poses)
         least = gaps.min(2)  # (persons, K)
-        kept = np.full((len(least), 1), BERTH)
-        kept[0] = KEPT
+        kept = np.full((len(least), 1), PEDESTRIAN_MARGIN_M)
+        kept[0] = FOLLOWED_MARGIN_M
         short = (kept - least).max(0).clip(min=0.0)
         near = np.maximum(1.0 - gaps[1:].min(0, initial=np.inf), 0.0)
-        return COLLISION * (least.min(0) < GUARD) + CLOSE * short**2 + (speed**2 * near).mean(1)
+        return (
+            COLLISION_COST * (least.min(0) < COLLISION_CLEARANCE_M)
+            + CLOSENESS_WEIGHT * short**2
+            + (speed**2 * near).mean(1)
+        )
 
-    def _unseen(self, situation: Situation, rollouts: Rollouts, speed: Array) -> Array:
-        """Fast into what the scan does not show."""
+    def _hidden_space_cost(self, situation: Situation, rollouts: Rollouts, speed: Array) -> Array:
+        """Return the cost of speed in space that the scan does not show."""
         place = to_sensor(rollouts.poses[..., :2].reshape(-1, 2), situation.sensor)
         distance = np.hypot(*place.T)
         bearing = np.arctan2(place[:, 1], place[:, 0])
-        hidden = (distance > self.length) & ~(situation.scan.at(bearing) > distance - 0.2)
+        hidden = (distance > self.length) & ~(situation.scan.range_at(bearing) > distance - 0.2)
         person = to_sensor(situation.person[None, :2], situation.sensor)[0]
-        behind = np.abs(_wrapped(bearing - np.arctan2(person[1], person[0]))) < np.arctan2(
-            2.0 * BODY, np.hypot(*person)
+        behind = np.abs(_wrap_angle(bearing - np.arctan2(person[1], person[0]))) < np.arctan2(
+            2.0 * PERSON_RADIUS_M, np.hypot(*person)
         )
-        hidden &= ~behind  # where the person walks, nothing else is
+        hidden &= ~behind  # the path of the person is free
         return (2.0 * speed**2 * hidden.reshape(speed.shape)).mean(1)
 
-    def _effort(self, situation: Situation, rollouts: Rollouts) -> Array:
+    def _effort_cost(self, situation: Situation, rollouts: Rollouts) -> Array:
+        """Return the cost of command changes, lateral and turning motion, and walking backward."""
         first = rollouts.commands[:, :1] - situation.command
         changes = np.concatenate([first, np.diff(rollouts.commands, axis=1)], axis=1)
-        used = USE * rollouts.commands**2
+        used = EFFORT_WEIGHTS * rollouts.commands**2
         back = np.minimum(rollouts.commands[..., 0], 0.0) ** 2
-        return (CHANGES * changes**2 + used).sum(2).mean(1) + 2.0 * back.mean(1)
+        return (CHANGE_WEIGHTS * changes**2 + used).sum(2).mean(1) + 2.0 * back.mean(1)
 
 
-def _wrapped(angle: Array) -> Array:
+def _wrap_angle(angle: Array) -> Array:
+    """Return angles wrapped to [-pi, pi)."""
     return (angle + np.pi) % (2.0 * np.pi) - np.pi

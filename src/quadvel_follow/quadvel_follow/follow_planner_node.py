@@ -1,4 +1,4 @@
-"""The node `follow_planner`: scan, odom and persons to cmd_vel_follow. What to do is `follow_planner`'s matter."""
+"""ROS node `follow_planner`: scan, odom and people in, velocity cmd_vel_follow out."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, seconds
 from quadvel_nodes.node import read_parameters, run
 
-from .follow_planner import PERIOD, FollowConfig, FollowPlanner, Plan, State
+from .follow_planner import PERIOD_S, FollowConfig, FollowPlanner, Plan, State
 from .person_tracker import deviation
 from .planar import planar_pose, planar_twist, scan_ranges
 from .state_log import StateLog
 
-GOOD = (State.FOLLOWING, State.WAITING)
+OK_STATES = (State.FOLLOWING, State.WAITING)
 
 
 class FollowPlannerNode(Node):
-    """Messages to a FollowPlanner, and what it says to messages."""
+    """ROS node around a FollowPlanner."""
 
     def __init__(self) -> None:
         super().__init__("follow_planner")
         self._planner = FollowPlanner(read_parameters(self, FollowConfig))
-        self._refusals, self._refused = Refusals(), 0
-        self._frame, self._said = "", ""
+        self._refusals, self._refused_before = Refusals(), 0
+        self._frame, self._state_text = "", ""
         self._log = StateLog()
         self._plan: Plan | None = None
         self._velocity = self.create_publisher(Twist, "cmd_vel_follow", 10)
@@ -45,7 +45,7 @@ class FollowPlannerNode(Node):
         self.create_subscription(Odometry, "person/odometry", self._on_person, 10)
         self.create_subscription(Persons, "persons", self._on_persons, 10)
         self.create_subscription(ControllerState, "controller/state", self._on_robot, 1)
-        self.create_timer(PERIOD, self._step)
+        self.create_timer(PERIOD_S, self._step)
         self.create_timer(1.0, self._report)
 
     def _now(self) -> float:
@@ -73,7 +73,7 @@ class FollowPlannerNode(Node):
         self._frame = message.header.frame_id
 
     def _on_person(self, message: Any) -> None:
-        """Its velocity is in its own frame."""
+        """Receive the followed person; its velocity is in the person's own frame."""
         try:
             x, y, yaw = planar_pose(message.pose.pose)
             ahead, left, _ = planar_twist(message.twist.twist)
@@ -99,9 +99,9 @@ class FollowPlannerNode(Node):
         twist = Twist()
         twist.linear.x, twist.linear.y, twist.angular.z = plan.velocity.tolist()
         self._velocity.publish(twist)
-        text = f"{plan.state.value}: {plan.words}"
-        self._said = text
-        if line := self._log.line(self._now(), text):
+        text = f"{plan.state.value}: {plan.reason}"
+        self._state_text = text
+        if line := self._log.next_line(self._now(), text):
             self.get_logger().info(line)
         self._state.publish(String(data=text))
         self._way.publish(self._path(plan))
@@ -109,7 +109,7 @@ class FollowPlannerNode(Node):
     def _path(self, plan: Plan) -> Any:
         message = Path()
         message.header.stamp, message.header.frame_id = self.get_clock().now().to_msg(), self._frame
-        for x, y, yaw in plan.way.tolist():
+        for x, y, yaw in plan.path.tolist():
             place = PoseStamped(header=message.header)
             place.pose.position.x, place.pose.position.y = x, y
             place.pose.orientation.z, place.pose.orientation.w = np.sin(yaw / 2), np.cos(yaw / 2)
@@ -117,10 +117,10 @@ class FollowPlannerNode(Node):
         return message
 
     def _report(self) -> None:
-        """Once a second: what it does, and what was refused."""
-        refused, self._refused = self._refusals.total - self._refused, self._refusals.total
-        level = DiagnosticStatus.OK if self._plan and self._plan.state in GOOD else DiagnosticStatus.WARN
-        summary = self._said or "starts"
+        """Publish the diagnostics of the last second."""
+        refused, self._refused_before = self._refusals.total - self._refused_before, self._refusals.total
+        level = DiagnosticStatus.OK if self._plan and self._plan.state in OK_STATES else DiagnosticStatus.WARN
+        summary = self._state_text or "starts"
         if refused:
             level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
             self.get_logger().warning(summary, throttle_duration_sec=QUIET)
@@ -133,5 +133,9 @@ class FollowPlannerNode(Node):
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the node."""
+    """Run the node `follow_planner`.
+
+    Args:
+        args: Command line arguments, those of ROS included; None: `sys.argv`.
+    """
     run(FollowPlannerNode, args)

@@ -1,4 +1,4 @@
-"""Where in a laser scan legs are: things in it, and a small network that knows legs from the rest."""
+"""Leg detector for laser scans: clusters and a small network that classifies them."""
 
 from __future__ import annotations
 
@@ -9,19 +9,25 @@ import numpy as np
 import onnxruntime
 from numpy.typing import ArrayLike, NDArray
 
-from .clusters import NUMBERS, WIDEST, Scan, describe, find_clusters
+from .clusters import FEATURE_COUNT, MAX_CLUSTER_WIDTH_M, Scan, cluster_features, find_clusters
 
 Array = NDArray[np.float64]
 
 SHIPPED_MODEL = Path(__file__).parent / "models" / "legs.onnx"
-SURE = 0.55  # probability from which `detect` names a thing
-INWARD = 0.045  # m, from the readings on a leg's near side to its axis
+LEG_PROBABILITY = 0.55
+"""Probability from which `detect` reports a leg."""
+LEG_AXIS_DEPTH_M = 0.045
+"""Distance from the visible side of a leg to its axis."""
 
 
 @attrs.frozen
-class Legs:
-    """What may be legs, one of a pair or a pair that touches: position (K, 2) in m of their axes, sensor frame; probability (K,);
-    width (K,) in m.
+class LegCandidates:
+    """Clusters that may be a leg or a pair of touching legs.
+
+    Attributes:
+        position: Position of the leg's axis in the sensor frame, (K, 2), m.
+        probability: Probability of a leg or pair, (K,).
+        width: Width of the cluster, (K,), m.
     """
 
     position: Array
@@ -30,38 +36,61 @@ class Legs:
 
 
 class LegDetector:
-    """Finds legs in single scans of any resolution.
-
-    model: the network's file, ONNX. Raises ValueError, one sentence with the file's name, where it is missing or
-    another kind of network.
-    """
+    """Detects legs in single scans of any resolution."""
 
     def __init__(self, model: str | Path = SHIPPED_MODEL) -> None:
-        self._session = _open(Path(model))
+        """Load the network.
+
+        Args:
+            model: ONNX file of the classifier.
+
+        Raises:
+            ValueError: The file is missing or of another kind; the message names it.
+        """
+        self._session = _open_session(Path(model))
 
     def detect(self, ranges: ArrayLike, angle_min: float, angle_increment: float) -> Array:
-        """Positions (K, 2) in m of legs, or of pairs of legs where these touch, in the sensor's frame, x ahead.
+        """Detect legs, or pairs of legs if they touch.
 
-        ranges (rays,) in m; NaN, infinite, zero and negative ones are rays without a reading. Angles in rad,
-        counter-clockwise. Raises ValueError for what is no scan.
+        Args:
+            ranges: Ranges, (rays,), m; NaN, infinite and non-positive ones are rays without an
+                echo.
+            angle_min: Angle of the first ray, rad, counter-clockwise.
+            angle_increment: Angle between two rays, rad.
+
+        Returns:
+            Positions in the sensor frame, (K, 2), m, x ahead.
+
+        Raises:
+            ValueError: The scan is malformed.
         """
-        legs = self.find(Scan.checked(ranges, angle_min, angle_increment))
-        return legs.position[legs.probability >= SURE]
+        legs = self.find_candidates(Scan.validated(ranges, angle_min, angle_increment))
+        return legs.position[legs.probability >= LEG_PROBABILITY]
 
-    def find(self, scan: Scan) -> Legs:
-        """Everything in a scan that is narrow enough, with the probability that it is a leg or a pair."""
+    def find_candidates(self, scan: Scan) -> LegCandidates:
+        """Classify all clusters that are narrow enough.
+
+        Args:
+            scan: The scan.
+
+        Returns:
+            Candidates with their probabilities.
+        """
         clusters = find_clusters(scan)
-        narrow = clusters.width < WIDEST
+        narrow = clusters.width < MAX_CLUSTER_WIDTH_M
         probability = np.zeros(0)
         if narrow.any():
-            things = describe(scan, clusters)[narrow]
+            things = cluster_features(scan, clusters)[narrow]
             (probability,) = self._session.run(None, {"things": things})
         centre = clusters.centre[narrow]
         outward = centre / np.hypot(*centre.T)[:, None]
-        return Legs(centre + INWARD * outward, probability.astype(float), clusters.width[narrow])
+        return LegCandidates(
+            centre + LEG_AXIS_DEPTH_M * outward, probability.astype(float), clusters.width[narrow]
+        )
 
 
-def _open(path: Path) -> onnxruntime.InferenceSession:
+def _open_session(path: Path) -> onnxruntime.InferenceSession:
+    """Return the session of a classifier file."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file, expected a network that finds legs, ONNX")
     options = onnxruntime.SessionOptions()
@@ -72,6 +101,6 @@ def _open(path: Path) -> onnxruntime.InferenceSession:
     except Exception as error:  # onnxruntime's exceptions share no other base
         raise ValueError(f"{path}: is not an ONNX network that onnxruntime can read") from error
     found = [(entry.name, entry.shape[-1]) for entry in session.get_inputs()]
-    if found != [("things", NUMBERS)]:
-        raise ValueError(f"{path}: inputs are {found}, expected {[('things', NUMBERS)]}")
+    if found != [("things", FEATURE_COUNT)]:
+        raise ValueError(f"{path}: inputs are {found}, expected {[('things', FEATURE_COUNT)]}")
     return session

@@ -1,7 +1,8 @@
-"""Recorded paths, freed of their noise: from many points with errors to few smooth pieces between true corners. No ROS.
+"""Smoothing of recorded paths: noisy points become few smooth pieces between true corners. No ROS.
 
-The noise is estimated from the points themselves. Neighbours that noise alone may explain become one place; between corners a
-smoothing spline, as stiff as the noise permits, replaces the places. A hand-written path has no noise and keeps its points.
+The noise is estimated from the points. Neighbours that noise may explain merge into one place.
+Between corners a smoothing spline, as stiff as the noise permits, replaces the places. A path
+without noise, such as a hand-written one, keeps its points.
 """
 
 from __future__ import annotations
@@ -16,36 +17,40 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 Array = NDArray[np.float64]
 
 FEW_POINTS = 12
-"""Below this number of points no noise is estimated: these are corners that somebody wrote"""
+"""With fewer points no noise is estimated: these are hand-written corners."""
 MANY_POINTS = 100
-"""From this number of points on a path is surely recorded, and more noise is believed"""
-EXACT_M = 0.002
-"""m, noise of a path that has none: far below what a walking robot can follow"""
+"""With at least this number of points the path is recorded and may have more noise."""
+EXACT_NOISE_M = 0.002
+"""Noise in m of an exact path: far below what a walking robot can follow."""
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of a plane normal vector of unit variance an axis"""
-UNEVEN = 3.0
+UNEVEN_RATIO = 3.0
 """Ratio of the two estimates of the noise above which the points lie at uneven distances"""
-CORNER = np.radians(50.0)
-"""rad; a sharper turn between two legs is a corner"""
-LONE_CORNER = np.radians(25.0)
-"""rad; a sharper turn is a corner if it is also twice as sharp as its neighbours, which in a sampled curve it is not"""
-LONG_LEG = 3.0
-"""Median legs; a longer leg is straight, and gets points of its own so that no spline bulges"""
-PINNED = 0.03
-"""Share of its error that a corner keeps, so that the pieces before and after it meet there"""
-PERMITTED = 1.8
-"""Mean squared distance, in variances of the noise, of places from their spline: a bit less than the 2 of two axes"""
-FIT_POINTS = 5
+CORNER_RAD = np.radians(50.0)
+"""A sharper turn between two legs is a corner."""
+LONE_CORNER_RAD = np.radians(25.0)
+"""A sharper turn is a corner if it is twice as sharp as its neighbours (no sampled curve)."""
+LONG_LEG_RATIO = 3.0
+"""A leg of more median lengths is straight; it gets additional points, so that no spline bulges."""
+CORNER_ERROR_SHARE = 0.03
+"""Factor of a corner's error, so that the adjacent pieces meet there."""
+MAX_MEAN_SQUARE = 1.8
+"""Largest mean squared residual of the spline in noise variances: below the 2 of two axes."""
+MIN_SPLINE_POINTS = 5
 """Least number of points of a smoothing spline"""
-STIFFNESS = (-4.0, 12.0)
+PENALTY_DECADES = (-4.0, 12.0)
 """Decades of the spline's penalty, in cubed legs: from interpolation to a straight line"""
 
 
 @attrs.frozen
 class NoiseLimits:
-    """Noise (m, one axis) that a kind of file may have: at least, at most with few points, and at most with many.
+    """Position noise (m, standard deviation per axis) that a kind of file may have.
 
-    `shared` is the share of it that neighbours have in common, which no mean over them takes away.
+    Attributes:
+        least: Lower bound.
+        few: Upper bound for a path of few points.
+        many: Upper bound for a path of many points.
+        shared: Share of the noise that neighbours have in common and averaging does not remove.
     """
 
     least: float
@@ -56,56 +61,74 @@ class NoiseLimits:
 
 @attrs.frozen
 class SmoothPath:
-    """Pieces (n, 2), m, each ending where the next begins, at a corner; noise (m, one axis) that was smoothed away."""
+    """Smoothed path.
+
+    Attributes:
+        pieces: Pieces, (n, 2) each, m; each ends where the next begins, at a corner.
+        noise: Removed noise, m, standard deviation per axis.
+    """
 
     pieces: list[Array]
     noise: float
 
 
 def smooth_path(points: Array, limits: NoiseLimits) -> SmoothPath:
-    """The pieces of a path of points.
+    """Smooth a path.
 
     Args:
-        points: (n, 2), m, in the order of walking, two at least, neighbours differ.
-        limits: what noise to believe.
+        points: Points in the order of walking, (n, 2), m, n >= 2, no point repeated directly.
+        limits: Bounds of the noise.
+
+    Returns:
+        Pieces between corners.
     """
-    found = estimated_noise(points)
+    found = estimate_noise(points)
     dense = len(points) >= FEW_POINTS
     believed = dense and found <= (limits.many if len(points) >= MANY_POINTS else limits.few)
-    noise = max(found, limits.least) if believed else EXACT_M
+    noise = max(found, limits.least) if believed else EXACT_NOISE_M
     shared = limits.shared * noise if believed else 0.0
-    places, counts = _merged(points, noise, shared)
+    places, counts = _merge_places(points, noise, shared)
     if len(places) < 2:
         places, counts = points[[0, -1]], np.ones(2)
     errors = np.hypot(noise / np.sqrt(counts), shared)
-    corners = _corners(places, errors)
-    errors[corners] *= PINNED
+    corners = _find_corners(places, errors)
+    errors[corners] *= CORNER_ERROR_SHARE
     ends = [0, *corners, len(places) - 1]
     pieces = [
-        _smoothed(places[first : last + 1], errors[first : last + 1])
+        _smooth_piece(places[first : last + 1], errors[first : last + 1])
         for first, last in itertools.pairwise(ends)
     ]
     return SmoothPath(pieces, noise)
 
 
-def estimated_noise(points: Array) -> float:
-    """Standard deviation (m, one axis) of what neighbours on both sides do not predict; 0 for few points.
+def estimate_noise(points: Array) -> float:
+    """Estimate the position noise as what neighbours on both sides do not predict.
 
-    Chords that noise lengthens hide a part of it, and points at uneven distances look like noise if they count as even: the
-    former estimate holds where the two are far apart.
+    Two parameters along the path are used. Chord lengths hide noise that lengthens the chords;
+    point numbers mistake uneven spacing for noise. If both results differ much, chord lengths are
+    right.
+
+    Args:
+        points: Points, (n, 2), m.
+
+    Returns:
+        Standard deviation per axis, m; 0 for fewer than FEW_POINTS points.
     """
     if len(points) < FEW_POINTS:
         return 0.0
-    by_chords = _unpredicted(points, _chords(points))
-    by_numbers = _unpredicted(points, np.arange(len(points), dtype=float))
-    return by_numbers if by_numbers < UNEVEN * by_chords else by_chords
+    by_chords = _prediction_error(points, _chord_lengths(points))
+    by_numbers = _prediction_error(points, np.arange(len(points), dtype=float))
+    return by_numbers if by_numbers < UNEVEN_RATIO * by_chords else by_chords
 
 
-def _unpredicted(points: Array, along: Array) -> float:
-    """How far (m, one axis) points lie from the cubics through their four neighbours, x and y over `along` (n,).
+def _prediction_error(points: Array, along: Array) -> float:
+    """Return the median error (m, per axis) of cubics through four neighbours, over `along` (n,).
 
-    The median over the points leaves corners and leaps out.
+    The median ignores corners and leaps.
     """
+    # Lagrange weights of the cubic through the neighbours -2, -1, 1, 2 at the middle point:
+    # w_j = prod_{i != j} (s - s_i) / (s_j - s_i). With noise sigma the residual is a 2-D normal
+    # vector of deviation sigma sqrt(1 + sum w_j^2) per axis; its length is Rayleigh distributed.
     middle = np.arange(2, len(points) - 2)
     around = middle[:, None] + [-2, -1, 1, 2]
     nodes, at = along[around], along[middle]
@@ -118,24 +141,27 @@ def _unpredicted(points: Array, along: Array) -> float:
     return float(np.median(np.hypot(*missed.T) / expected))
 
 
-def _furthest(count: int) -> float:
-    """Standard deviations that the largest of so many errors hardly exceeds."""
+def _outlier_bound(count: int) -> float:
+    """Return a bound, in standard deviations, of the largest of `count` normal errors."""
     return 1.0 + float(np.sqrt(2.0 * np.log(count)))
 
 
-def _chords(points: Array) -> Array:
-    """Length of the polygon up to each point, (n,), m."""
+def _chord_lengths(points: Array) -> Array:
+    """Return the length of the polyline up to each point, (n,), m."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
 
 
-def _merged(points: Array, noise: float, shared: float) -> tuple[Array, Array]:
-    """Means of neighbours that noise alone may separate (k, 2), and how many points each is made of (k,).
+def _merge_places(points: Array, noise: float, shared: float) -> tuple[Array, Array]:
+    """Merge neighbours that noise alone may separate; return places (k, 2) and point counts (k,).
 
-    `noise` is the error of a point, `shared` (m, one axis) what a mean of points keeps of it.
+    The closest pairs merge first, so a robot that stood becomes one place.
 
-    The nearest pairs merge first. A robot that stood is one place, whatever its receiver said meanwhile.
+    Args:
+        points: Points, (n, 2), m.
+        noise: Noise of a point, m, per axis.
+        shared: Part of the noise that averaging does not remove, m, per axis.
     """
-    places, counts, same = points, np.ones(len(points)), _furthest(len(points))
+    places, counts, same = points, np.ones(len(points)), _outlier_bound(len(points))
     while len(places) > 1:
         apart = np.hypot(*np.diff(places, axis=0).T)
         apart /= np.sqrt(noise**2 * (1.0 / counts[:-1] + 1.0 / counts[1:]) + 2.0 * shared**2)
@@ -151,31 +177,38 @@ def _merged(points: Array, noise: float, shared: float) -> tuple[Array, Array]:
     return places, counts
 
 
-def _corners(places: Array, errors: Array) -> list[int]:
-    """Indices of places at which a path turns sharply, beyond doubt at these errors (m, (k,))."""
+def _find_corners(places: Array, errors: Array) -> list[int]:
+    """Return indices of places with a sharp turn that their errors (k,) in m cannot explain."""
     legs = np.diff(places, axis=0)
-    turns = turns_of(legs)
+    turns = turn_angles(legs)
     headings = np.hypot(errors[:-1], errors[1:]) / np.hypot(*legs.T)
-    doubt = _furthest(len(places)) * np.hypot(headings[:-1], headings[1:])
+    doubt = _outlier_bound(len(places)) * np.hypot(headings[:-1], headings[1:])
     sharp = np.abs(turns)
     padded = np.concatenate([[0.0], turns, [0.0]])
-    beside = np.maximum(padded[:-2] * np.sign(turns), padded[2:] * np.sign(turns))
-    lone = (sharp > LONE_CORNER + doubt) & (sharp > 2.0 * beside)
-    return [int(i) + 1 for i in np.flatnonzero((sharp > CORNER + doubt) | lone)]
+    neighbours = np.maximum(padded[:-2] * np.sign(turns), padded[2:] * np.sign(turns))
+    lone = (sharp > LONE_CORNER_RAD + doubt) & (sharp > 2.0 * neighbours)
+    return [int(i) + 1 for i in np.flatnonzero((sharp > CORNER_RAD + doubt) | lone)]
 
 
-def turns_of(legs: Array) -> Array:
-    """Angles from each of the legs (n, 2) to the next, (n - 1,), rad, to the left positive."""
+def turn_angles(legs: Array) -> Array:
+    """Compute the angles between consecutive legs.
+
+    Args:
+        legs: Vectors, (n, 2).
+
+    Returns:
+        Angles, (n - 1,), rad, positive to the left.
+    """
     headings = np.arctan2(legs[:, 1], legs[:, 0])
     return np.asarray((np.diff(headings) + np.pi) % (2.0 * np.pi) - np.pi)
 
 
-def _smoothed(places: Array, errors: Array) -> Array:
-    """The stiffest spline through the places that their errors (m, one axis) permit, as points (n, 2)."""
-    if len(places) < FIT_POINTS:
+def _smooth_piece(places: Array, errors: Array) -> Array:
+    """Return the stiffest spline that the errors (m, per axis) permit, as points (n, 2)."""
+    if len(places) < MIN_SPLINE_POINTS:
         return places
-    places, errors = _densified(places, errors)
-    along = _chords(places)
+    places, errors = _densify(places, errors)
+    along = _chord_lengths(places)
     weights = 1.0 / errors
     unit = float(np.median(np.diff(along))) ** 3 / float(np.median(errors)) ** 2
 
@@ -184,9 +217,10 @@ def _smoothed(places: Array, errors: Array) -> Array:
 
     def is_permitted(decade: float) -> bool:
         missed = np.hypot(*(spline(decade)(along) - places).T) / errors
-        return bool(np.mean(missed**2) <= PERMITTED and missed.max() <= _furthest(len(places)))
+        return bool(np.mean(missed**2) <= MAX_MEAN_SQUARE and missed.max() <= _outlier_bound(len(places)))
 
-    soft, stiff = STIFFNESS
+    # Bisection over the exponent of the penalty: the largest one whose residuals fit the noise.
+    soft, stiff = PENALTY_DECADES
     while stiff - soft > 0.25:
         middle = 0.5 * (soft + stiff)
         soft, stiff = (middle, stiff) if is_permitted(middle) else (soft, middle)
@@ -194,11 +228,11 @@ def _smoothed(places: Array, errors: Array) -> Array:
     return np.asarray(spline(soft)(finer))
 
 
-def _densified(places: Array, errors: Array) -> tuple[Array, Array]:
-    """The same with points in between on legs that are long among the others."""
+def _densify(places: Array, errors: Array) -> tuple[Array, Array]:
+    """Add points on legs that are much longer than the median."""
     lengths = np.hypot(*np.diff(places, axis=0).T)
     usual = max(float(np.median(lengths)), 1e-3 * float(lengths.max()))
-    parts = np.where(lengths > LONG_LEG * usual, np.ceil(lengths / usual), 1.0).astype(int)
+    parts = np.where(lengths > LONG_LEG_RATIO * usual, np.ceil(lengths / usual), 1.0).astype(int)
     index = np.arange(len(places), dtype=float)
     finer = np.concatenate([np.concatenate([k + np.arange(n) / n for k, n in enumerate(parts)]), index[-1:]])
     columns = [np.interp(finer, index, column) for column in (*places.T, errors)]

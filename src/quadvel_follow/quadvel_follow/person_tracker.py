@@ -1,8 +1,9 @@
-"""Who walks where: persons followed from scan to scan, through occlusion and crossing, and told from what stands about.
+"""Multi-person tracker for laser scans that handles occlusion, crossing and static objects.
 
-Everything in a scan that may be a leg belongs to some hypothesis, a table's as well as a person's, so that what stands
-about keeps its own readings and none of them draws a person away. A hypothesis is confirmed as a person when the
-detector has believed in its legs and it has walked. Each hypothesis is a Kalman filter of constant velocity.
+Every possible leg in a scan belongs to a hypothesis, that of a table as well as that of a person.
+So static objects keep their own readings and do not attract people. A hypothesis is confirmed as a
+person when the detector classified its legs and it has walked. Each hypothesis is a Kalman filter
+with constant velocity.
 """
 
 from __future__ import annotations
@@ -17,27 +18,42 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 
 from .clusters import Scan
+from .free_space import MEMORY_S, MIN_AGE_S, ScanHistory, check_places, to_frame, to_sensor
 from .leg_detector import LegDetector
-from .looking import AGE, MEMORY, Past, look, to_frame, to_sensor
 from .scan_motion import ScanOdometry
 
 Array = NDArray[np.float64]
 
-GATE = 13.8  # squared Mahalanobis distance in the plane that one leg in 1000 exceeds
-UNASSIGNED_COST = 9.0  # cost at which a leg rather belongs to none
-PERSONS = 3.0  # by which it costs less that a leg is a person's than that it is something else's
-UNLIKE_IT = 4.0  # cost of a leg that was there before, for one who walks; of one that came, for what stands
-UNSURE = 0.02  # by which a probability may be wrong
-STANDING = 3.0  # looks more that found it in its place than not, for what stands
-WALKING = 0.4  # m/s, from which somebody walks
-FORBIDDEN = 1e6  # cost of an assignment beyond the gate
-SECOND_LEG = 2.0  # cost of a second leg: two legs between two persons are one of each
-MERGED = 0.25  # m, width from which a thing is two legs beside each other
-STRIDE = 0.5  # m, between the legs of a person, as far as they are made one
-RECENT = 1.0  # s, that is of late
-BELIEVING = 2.0  # s, over which what was found out about a hypothesis counts
-SWING = 0.2  # s, for which the error of a person's middle is the same
-PERSON = np.array([-0.2, -0.1, 0.0, 0.1, 0.2])  # m, from the middle of a person to its sides
+GATE_CHI2 = 13.8
+"""Gate of the squared Mahalanobis distance in the plane: one leg in 1000 exceeds it."""
+UNASSIGNED_COST = 9.0
+"""Cost of a leg that belongs to no hypothesis."""
+PERSON_BONUS = 3.0
+"""Reduction of the cost of a leg of a confirmed person."""
+MISMATCH_COST = 4.0
+"""Cost of a static leg for a walking person, and of a new leg for a static object."""
+PROBABILITY_ERROR = 0.02
+"""Error of the classifier's probabilities; bounds the log odds."""
+STANDING_EVIDENCE = 3.0
+"""Excess of occupied over empty checks from which an object is static."""
+WALKING_SPEED = 0.4
+"""Speed in m/s from which a person walks."""
+FORBIDDEN_COST = 1e6
+"""Cost of an assignment outside the gate."""
+SECOND_LEG_COST = 2.0
+"""Cost of a second leg: of two legs between two people, each gets one."""
+MERGED_WIDTH_M = 0.25
+"""Width from which a cluster is two legs next to each other."""
+MAX_STRIDE_M = 0.5
+"""Largest distance between the legs of one person."""
+RECENT_S = 1.0
+"""Time constant of recent means."""
+EVIDENCE_TIME_S = 2.0
+"""Time constant with which evidence fades."""
+SWING_TIME_S = 0.2
+"""Correlation time of the error between the legs' middle and the person's centre."""
+PERSON_OFFSETS_M = np.array([-0.2, -0.1, 0.0, 0.1, 0.2])
+"""Lateral offsets at which a person's place is checked."""
 
 
 def _positive(default: float) -> Any:
@@ -50,23 +66,29 @@ def _positive(default: float) -> Any:
 
 @attrs.frozen
 class TrackerConfig:
-    """What the tracker takes for granted of persons and scanners.
+    """Parameters of the tracker.
 
-    acceleration: m^2/s^3, density of the white noise that changes a velocity
-    both_legs, one_leg: m, standard deviation of a person's position by the middle of both legs, by one alone
-    first_speed: m/s, standard deviation of the velocity of what was seen first
-    reach: m, from a person's expected position to its leg at most
-    possible: probability from which a thing may be a leg
-    walked: m, from where it was first seen, after which a hypothesis may be a person
-    moved: share of the looks at its places, then and now, that found them empty, from which it may be one
-    steady: share of the scans in which it was seen, from which it may be one
-    surprise: m, from where it is expected to the middle of its legs, up to which it may be one
-    pairs: share of scans with both legs, from which it may be one
-    belief: mean probability of its legs, from which it may be one
-    watched, sightings: s since it was first seen, and scans in which it was, from which it may be one
-    patience: s, for which a person who is hidden is waited for
-    patience_in_view: s, the same where the scanner looks at an empty place
-    forgotten: s, without a leg, after which a hypothesis is given up
+    Raises:
+        ValueError: A value is not a finite positive number.
+
+    Attributes:
+        acceleration: Density of the white noise that changes the velocity, m^2/s^3.
+        both_legs: Standard deviation of a position from the middle of both legs, m.
+        one_leg: Standard deviation of a position from one leg, m.
+        first_speed: Standard deviation of the initial velocity, m/s.
+        reach: Largest distance from the predicted position to a leg, m.
+        possible: Smallest probability of a possible leg.
+        walked: Smallest distance from the first position of a person, m.
+        moved: Smallest share of checks that found its places empty before or after it was there.
+        surprise: Largest mean distance from predicted to measured position of a person, m.
+        pairs: Smallest share of scans that show both legs of a person.
+        belief: Smallest mean probability of the legs of a person.
+        watched: Smallest time since a person was first seen, s.
+        sightings: Smallest number of scans in which a person was seen.
+        steady: Smallest share of scans in which a person was seen.
+        patience: Time for which a hidden person is kept, s.
+        patience_in_view: Time for which a person is kept while its place is seen empty, s.
+        forgotten: Time without a leg after which an unconfirmed hypothesis is removed, s.
     """
 
     acceleration: float = _positive(0.1)
@@ -89,17 +111,29 @@ class TrackerConfig:
 
 
 def deviation(covariance: Array) -> float:
-    """Largest standard deviation, in any direction, of something with this covariance (2, 2)."""
+    """Compute the largest standard deviation in any direction.
+
+    Args:
+        covariance: Covariance, (2, 2).
+
+    Returns:
+        Square root of its largest eigenvalue.
+    """
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
 @attrs.frozen
 class Track:
-    """A person, or what may become one, at the time of the scan.
+    """Estimate of a person, or of a candidate, at the time of the scan.
 
-    id: stays with it; position (2,): m, velocity (2,): m/s, covariance (4, 4) of x, y, vx, vy: in the frame of the sensor's
-    pose; age: s since it was first seen; seen: time at which a leg of it was seen last, s, on the clock of the scans;
-    confirmed: whether it is taken for a person.
+    Attributes:
+        id: Identity; does not change.
+        position: Position in the tracking frame, (2,), m.
+        velocity: Velocity, (2,), m/s.
+        covariance: Covariance of x, y, vx, vy, (4, 4).
+        age: Time since it was first seen, s.
+        seen: Time of the last scan with one of its legs, s.
+        confirmed: Whether it is a person.
     """
 
     id: int
@@ -112,14 +146,20 @@ class Track:
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of the position in the direction in which it is largest, m."""
+        """Largest standard deviation of the position, m."""
         return deviation(self.covariance[:2, :2])
 
 
 @attrs.frozen
 class _Legs:
-    """What may be legs in a scan: position (K, 2) in the tracks' frame; probability; whether two in one; how many scans of
-    the past show the place empty, how many taken; all (K,).
+    """Possible legs of a scan in the tracking frame: (K, 2) in m, and arrays (K,).
+
+    Attributes:
+        position: Positions, m.
+        probability: Probability of a leg or pair.
+        merged: Whether two legs touch.
+        empty: Number of past scans that show the place empty.
+        taken: Number of past scans that show it occupied.
     """
 
     position: Array
@@ -131,7 +171,7 @@ class _Legs:
 
 @attrs.define
 class _Hypothesis:
-    """Something with legs. state (4,): x, y, vx, vy; belief: mean probability of its legs over the time it was seen."""
+    """Object with legs. `state`: x, y (m), vx, vy (m/s); `belief`: mean probability of its legs."""
 
     id: int
     state: Array
@@ -150,7 +190,10 @@ class _Hypothesis:
     trail: deque[tuple[float, Array]] = attrs.field(factory=deque)  # when its legs were seen where
 
     def correct(self, position: Array, variance: float) -> None:
-        """The Kalman filter's correction by a measured position (2,), m, whose coordinates have this variance, m^2."""
+        """Correct the Kalman filter by a position (2,) in m with a variance per axis in m^2.
+
+        K = P H^T (H P H^T + R)^-1, x += K (z - H x), P -= K H P, where H selects x, y.
+        """
         gain = self.covariance[:, :2] @ np.linalg.inv(self.covariance[:2, :2] + variance * np.eye(2))
         self.state = self.state + gain @ (position - self.state[:2])
         covariance = self.covariance - gain @ self.covariance[:2]
@@ -158,30 +201,40 @@ class _Hypothesis:
 
     @property
     def moved(self) -> float:
-        """The share of looks that found its places empty, when it was not there."""
+        """Share of checks that found its places empty while it was elsewhere."""
         return self.empty / (self.empty + self.taken + 2.0)
 
 
 def _is_leg_of(hypothesis: _Hypothesis, walker: _Hypothesis) -> bool:
-    """Whether it is but the other leg of one who walks: it is beside, came later, and was not there before."""
+    """Return whether it is the other leg of a person: nearby, newer, and at a free place."""
     return (
         walker.id < hypothesis.id
         and hypothesis.taken <= hypothesis.empty
-        and bool(np.hypot(*(walker.state[:2] - hypothesis.state[:2])) < STRIDE)
+        and bool(np.hypot(*(walker.state[:2] - hypothesis.state[:2])) < MAX_STRIDE_M)
     )
 
 
 class PersonTracker:
-    """Takes one scan after the other."""
+    """Tracks people from scan to scan.
+
+    Attributes:
+        config: Parameters.
+    """
 
     def __init__(self, config: TrackerConfig | None = None, detector: LegDetector | None = None) -> None:
+        """Create a tracker without tracks.
+
+        Args:
+            config: Parameters; None: the defaults.
+            detector: Leg detector; None: the shipped one.
+        """
         self.config = config or TrackerConfig()
         self._detector = detector or LegDetector()
         self._hypotheses: list[_Hypothesis] = []
-        self._past = Past()
+        self._history = ScanHistory()
         self._odometry = ScanOdometry()
         self._time: float | None = None  # s, of the last scan
-        self._given: bool | None = None  # whether the sensor's pose comes from outside
+        self._has_external_pose: bool | None = None  # whether the sensor's pose comes from outside
         self._next_id = 1
 
     def update(
@@ -192,29 +245,42 @@ class PersonTracker:
         angle_increment: float,
         sensor_pose: Sequence[float] | None = None,
     ) -> list[Track]:
-        """The persons, and what may become some, at `time` (s), confirmed ones first.
+        """Process a scan. After an error the tracker is unchanged.
 
-        ranges, angles: as `LegDetector.detect` takes them. sensor_pose: x, y (m) and yaw (rad) of the sensor in the
-        frame, at rest, in which tracks are wanted, such as the odometry's. None, for all scans or for none: the tracks
-        are in the sensor's own frame, and how it moves is told from the scans. Raises ValueError, with the field, what
-        it is and what was expected; all is then as it was before.
+        Args:
+            time: Time of the scan, s.
+            ranges: Ranges, (rays,), m, as in `LegDetector.detect`.
+            angle_min: Angle of the first ray, rad.
+            angle_increment: Angle between two rays, rad.
+            sensor_pose: Pose of the sensor in a fixed frame such as the odometry's, (3,): x, y in
+                m, yaw in rad. None, for all scans or for none: tracks are in the sensor frame, and
+                the motion of the sensor is estimated from the scans.
+
+        Returns:
+            Tracks of people and candidates, confirmed ones first.
+
+        Raises:
+            ValueError: A value is malformed; the message names field, value and expectation.
         """
-        scan = Scan.checked(ranges, angle_min, angle_increment)
-        dt = self._checked_step(time)
-        pose = self._checked_pose(sensor_pose, scan)
-        self._time, self._given = time, sensor_pose is not None
-        legs = self._legs(time, scan, pose)
+        scan = Scan.validated(ranges, angle_min, angle_increment)
+        dt = self._check_time(time)
+        pose = self._sensor_pose(sensor_pose, scan)
+        self._time, self._has_external_pose = time, sensor_pose is not None
+        legs = self._find_legs(time, scan, pose)
         self._predict(time, dt, scan, pose)
         theirs = self._assign(time, legs)
         self._correct(time, dt, theirs, legs)
-        self._begin(time, legs, theirs)
-        self._watch(time, dt, scan, pose)
-        self._judge(time, scan, pose)
-        self._past.add(time, scan, pose)
-        tracks = [self._track(h, time, pose) for h in self._hypotheses if h.confirmed or self._tells(h)]
+        self._start_hypotheses(time, legs, theirs)
+        self._check_left_places(time, dt, scan, pose)
+        self._confirm_and_prune(time, scan, pose)
+        self._history.add(time, scan, pose)
+        tracks = [
+            self._make_track(h, time, pose) for h in self._hypotheses if h.confirmed or self._is_plausible(h)
+        ]
         return sorted(tracks, key=lambda track: (not track.confirmed, track.id))
 
-    def _checked_step(self, time: float) -> float:
+    def _check_time(self, time: float) -> float:
+        """Return the time since the previous scan, s."""
         if not np.isfinite(time):
             raise ValueError(f"time is {time}, expected a finite time, s")
         if self._time is None:
@@ -225,11 +291,11 @@ class PersonTracker:
             )
         return time - self._time
 
-    def _checked_pose(self, pose: Sequence[float] | None, scan: Scan) -> Array:
-        """The sensor's pose: as it is given, or after what it moved since the scan before."""
-        if self._given is not None and self._given != (pose is not None):
+    def _sensor_pose(self, pose: Sequence[float] | None, scan: Scan) -> Array:
+        """Return the pose of the sensor: as given, or as estimated from the scans."""
+        if self._has_external_pose is not None and self._has_external_pose != (pose is not None):
             raise ValueError(
-                f"sensor_pose is {pose}, expected {'one' if self._given else 'None'} as for the scans before"
+                f"sensor_pose is {pose}, expected {'one' if self._has_external_pose else 'None'} as for the scans before"
             )
         if pose is not None:
             if np.shape(pose) != (3,) or not np.isfinite(np.asarray(pose, float)).all():
@@ -237,24 +303,28 @@ class PersonTracker:
                     f"sensor_pose is {pose}, expected x, y (m) and yaw (rad), three finite numbers"
                 )
             return np.asarray(pose, float)
-        return self._odometry.follow(scan)
+        return self._odometry.update(scan)
 
-    def _legs(self, time: float, scan: Scan, pose: Array) -> _Legs:
-        found = self._detector.find(scan)
+    def _find_legs(self, time: float, scan: Scan, pose: Array) -> _Legs:
+        """Return the possible legs of a scan."""
+        found = self._detector.find_candidates(scan)
         likely = found.probability > self.config.possible
         position = to_frame(found.position[likely], pose)
-        empty, taken = self._past.counts(time, position, pose)
-        return _Legs(position, found.probability[likely], found.width[likely] > MERGED, empty, taken)
+        empty, taken = self._history.count_evidence(time, position, pose)
+        return _Legs(position, found.probability[likely], found.width[likely] > MERGED_WIDTH_M, empty, taken)
 
     def _predict(self, time: float, dt: float, scan: Scan, pose: Array) -> None:
-        """Constant velocity, changed by white noise; who is out of sight does not walk on into what is seen to be empty."""
+        """Predict all hypotheses; a hidden one does not move into space that is seen empty.
+
+        White-noise acceleration of density q: Q = q [[dt^3/3, dt^2/2], [dt^2/2, dt]] per axis.
+        """
         if not self._hypotheses:
             return
         states = np.array([h.state for h in self._hypotheses])
         moved = states.copy()
         moved[:, :2] += dt * states[:, 2:]
         unseen = np.array([time - h.seen for h in self._hypotheses]) - dt > self.config.forgotten
-        stays = unseen & look(scan, to_sensor(moved[:, :2], pose), PERSON)[0]
+        stays = unseen & check_places(scan, to_sensor(moved[:, :2], pose), PERSON_OFFSETS_M)[0]
         moved[stays, :2] = states[stays, :2]
         transition = np.eye(4)
         transition[0, 2] = transition[1, 3] = dt
@@ -264,7 +334,7 @@ class PersonTracker:
             hypothesis.state, hypothesis.covariance = state, covariance
 
     def _assign(self, time: float, legs: _Legs) -> list[list[int]]:
-        """Which legs (none, one or two) belong to each hypothesis: the likeliest way for all together."""
+        """Return the legs (up to two) of each hypothesis by the assignment of lowest cost."""
         theirs: list[list[int]] = [[] for _ in self._hypotheses]
         if not theirs or not len(legs.position):
             return theirs
@@ -275,43 +345,49 @@ class PersonTracker:
         squared = np.einsum("hli,hij,hlj->hl", off, np.linalg.inv(spread), off)
         unseen = np.array([time - h.seen for h in self._hypotheses])
         reach = self.config.reach + self.config.first_speed * np.maximum(unseen - self.config.forgotten, 0.0)
-        near = (squared < GATE) & (np.hypot(off[..., 0], off[..., 1]) < reach[:, None])
-        cost = squared + np.log(np.linalg.det(spread) / self.config.one_leg**4)[:, None] + self._liking(legs)
-        cost = np.where(near, cost, FORBIDDEN)
-        twice = np.concatenate([cost, cost + SECOND_LEG])
+        near = (squared < GATE_CHI2) & (np.hypot(off[..., 0], off[..., 1]) < reach[:, None])
+        cost = (
+            squared + np.log(np.linalg.det(spread) / self.config.one_leg**4)[:, None] + self._type_cost(legs)
+        )
+        cost = np.where(near, cost, FORBIDDEN_COST)
+        # Assignment problem (Jonker-Volgenant): each hypothesis has two rows, one for each leg; the
+        # zero columns leave a row without a leg.
+        twice = np.concatenate([cost, cost + SECOND_LEG_COST])
         rows, columns = linear_sum_assignment(np.hstack([twice, np.zeros((len(twice), len(twice)))]))
         for row, column in zip(rows, columns, strict=True):
             if column < len(legs.position) and twice[row, column] < 0.0:
                 theirs[row % len(theirs)].append(int(column))
         return theirs
 
-    def _liking(self, legs: _Legs) -> Array:
-        """Cost (hypotheses, legs) by what both are, against a leg that belongs to none of them.
+    def _type_cost(self, legs: _Legs) -> Array:
+        """Return the cost (hypotheses, legs) of their types, relative to an unassigned leg.
 
-        A leg is rather a person's, and looks like one. Who walks comes to places that were empty; what stands does not.
+        A leg of a person looks like a leg. Who walks comes to places that were empty; what stands
+        does not.
         """
         confirmed = np.array([h.confirmed for h in self._hypotheses])
-        walks = confirmed & np.array([np.hypot(*h.state[2:]) > WALKING for h in self._hypotheses])
-        stands = ~confirmed & np.array([h.taken > h.empty + STANDING for h in self._hypotheses])
-        unlike = np.log((1.0 - legs.probability + UNSURE) / (legs.probability + UNSURE))
+        walks = confirmed & np.array([np.hypot(*h.state[2:]) > WALKING_SPEED for h in self._hypotheses])
+        stands = ~confirmed & np.array([h.taken > h.empty + STANDING_EVIDENCE for h in self._hypotheses])
+        unlike = np.log((1.0 - legs.probability + PROBABILITY_ERROR) / (legs.probability + PROBABILITY_ERROR))
         rested, came = (legs.taken > 0.0) & (legs.empty == 0.0), legs.empty > legs.taken
-        cost: Array = np.where(confirmed[:, None], unlike - PERSONS, 0.0) - UNASSIGNED_COST
-        return cost + UNLIKE_IT * (walks[:, None] & rested) + UNLIKE_IT * (stands[:, None] & came)
+        cost: Array = np.where(confirmed[:, None], unlike - PERSON_BONUS, 0.0) - UNASSIGNED_COST
+        return cost + MISMATCH_COST * (walks[:, None] & rested) + MISMATCH_COST * (stands[:, None] & came)
 
     def _correct(self, time: float, dt: float, theirs: list[list[int]], legs: _Legs) -> None:
-        """Correct each hypothesis by the middle of its legs, and keep what they tell of it."""
-        recent = min(1.0, dt / RECENT)
+        """Correct each hypothesis by the middle of its legs and update its statistics."""
+        recent = min(1.0, dt / RECENT_S)
         for hypothesis, pair in zip(self._hypotheses, theirs, strict=True):
             if not pair:
                 continue
             both = len(pair) == 2 or bool(legs.merged[pair[0]])
             middle, leg = legs.position[pair].mean(0), pair[0]
             off = float(np.hypot(*(middle - hypothesis.state[:2])))
-            # Legs swing: what the middle of a person is off by stays nearly the same from one quick scan to the next.
-            hypothesis.correct(middle, self._deviation(both) ** 2 * max(1.0, SWING / dt))
+            # Legs swing: the error of the middle is correlated over SWING_TIME_S, so that the
+            # variance of each of several scans in this time is increased.
+            hypothesis.correct(middle, self._deviation(both) ** 2 * max(1.0, SWING_TIME_S / dt))
             hypothesis.surprise += recent * (off - hypothesis.surprise)
             hypothesis.pairs += recent * (float(both) - hypothesis.pairs)
-            share = dt / (dt + min(time - hypothesis.born, BELIEVING))
+            share = dt / (dt + min(time - hypothesis.born, EVIDENCE_TIME_S))
             hypothesis.belief += share * (float(legs.probability[pair].max()) - hypothesis.belief)
             hypothesis.empty += float(legs.empty[leg])
             hypothesis.taken += float(legs.taken[leg])
@@ -320,17 +396,18 @@ class PersonTracker:
             hypothesis.trail.append((time, legs.position[leg]))
 
     def _deviation(self, both: bool) -> float:
+        """Return the standard deviation of a measured position, m."""
         return self.config.both_legs if both else self.config.one_leg
 
-    def _begin(self, time: float, legs: _Legs, theirs: list[list[int]]) -> None:
-        """New hypotheses of legs that belong to none: two beside each other make one."""
+    def _start_hypotheses(self, time: float, legs: _Legs, theirs: list[list[int]]) -> None:
+        """Start hypotheses at unassigned legs; two legs next to each other start one."""
         taken = {leg for pair in theirs for leg in pair}
         left = [leg for leg in range(len(legs.position)) if leg not in taken]
         while left:
             pair = [left.pop(0)]
             if left:
                 distances = np.hypot(*(legs.position[left] - legs.position[pair[0]]).T)
-                if distances.min() < STRIDE:
+                if distances.min() < MAX_STRIDE_M:
                     pair.append(left.pop(int(distances.argmin())))
             position = legs.position[pair].mean(0)
             deviations = [self._deviation(len(pair) == 2)] * 2 + [self.config.first_speed] * 2
@@ -347,35 +424,35 @@ class PersonTracker:
             )
             self._next_id += 1
 
-    def _watch(self, time: float, dt: float, scan: Scan, pose: Array) -> None:
-        """Look whether the places where legs were are empty now; what was seen long ago counts less."""
-        fading = np.exp(-dt / BELIEVING)
+    def _check_left_places(self, time: float, dt: float, scan: Scan, pose: Array) -> None:
+        """Check whether former places of the legs are empty now; old evidence fades."""
+        fading = np.exp(-dt / EVIDENCE_TIME_S)
         for hypothesis in self._hypotheses:
             hypothesis.scans += 1
             hypothesis.empty *= fading
             hypothesis.taken *= fading
-            while hypothesis.trail and time - hypothesis.trail[0][0] > MEMORY:
+            while hypothesis.trail and time - hypothesis.trail[0][0] > MEMORY_S:
                 hypothesis.trail.popleft()
         left = [
             (hypothesis, place)
             for hypothesis in self._hypotheses
             if hypothesis.seen == time
             for then, place in hypothesis.trail
-            if time - then >= AGE
+            if time - then >= MIN_AGE_S
         ]
         if left:
-            empty, taken = look(scan, to_sensor(np.array([place for _, place in left]), pose))
+            empty, taken = check_places(scan, to_sensor(np.array([place for _, place in left]), pose))
             for (hypothesis, _), is_empty, is_taken in zip(left, empty, taken, strict=True):
                 hypothesis.empty += is_empty
                 hypothesis.taken += is_taken
 
-    def _judge(self, time: float, scan: Scan, pose: Array) -> None:
-        """Confirm who has walked, give up who is gone, and what is a person's other leg."""
+    def _confirm_and_prune(self, time: float, scan: Scan, pose: Array) -> None:
+        """Confirm people that have walked; remove lost hypotheses and second legs."""
         if not self._hypotheses:
             return
         kept = []
         places = np.array([h.state[:2] for h in self._hypotheses])
-        in_view = look(scan, to_sensor(places, pose), PERSON)[0]
+        in_view = check_places(scan, to_sensor(places, pose), PERSON_OFFSETS_M)[0]
         for hypothesis, visible in zip(self._hypotheses, in_view, strict=True):
             hypothesis.confirmed = hypothesis.confirmed or self._has_walked(hypothesis, time)
             patience = self.config.patience_in_view if visible else self.config.patience
@@ -387,7 +464,7 @@ class PersonTracker:
         ]
 
     def _has_walked(self, hypothesis: _Hypothesis, time: float) -> bool:
-        """As a person does: on legs, steadily, to places that were empty."""
+        """Return whether it moves like a person: on legs, steadily, to places that were empty."""
         config = self.config
         return (
             hypothesis.moved > config.moved
@@ -399,13 +476,14 @@ class PersonTracker:
             and bool(np.hypot(*(hypothesis.state[:2] - hypothesis.origin)) > config.walked)
         )
 
-    def _tells(self, hypothesis: _Hypothesis) -> bool:
+    def _is_plausible(self, hypothesis: _Hypothesis) -> bool:
+        """Return whether an unconfirmed hypothesis is reported."""
         return hypothesis.sightings > 2 and hypothesis.belief > self.config.belief
 
-    def _track(self, hypothesis: _Hypothesis, time: float, pose: Array) -> Track:
-        """In the frame of the pose that was given, or in the sensor's."""
+    def _make_track(self, hypothesis: _Hypothesis, time: float, pose: Array) -> Track:
+        """Return the track in the frame of the given pose, or in the sensor frame."""
         state, covariance = hypothesis.state.copy(), hypothesis.covariance.copy()
-        if not self._given:
+        if not self._has_external_pose:
             turn = np.kron(
                 np.eye(2), [[np.cos(pose[2]), np.sin(pose[2])], [-np.sin(pose[2]), np.cos(pose[2])]]
             )

@@ -1,6 +1,6 @@
-"""The node `person_tracker`: scan and odom to person, person/odometry, persons and markers, and the service select_person.
+"""ROS node `person_tracker`: scan and odom in; person, person/odometry, persons and markers out.
 
-How persons are tracked is `person_tracker`'s matter, which of them is meant `selection`'s.
+The service select_person selects the followed person, see `selection`.
 """
 
 from __future__ import annotations
@@ -31,29 +31,42 @@ from .planar import planar_pose, scan_ranges
 from .pose_history import PoseHistory
 from .selection import Selection
 
-SET_BACK = 1.0  # s, by which a scan is older than the one before, from which time was set back
-UNKNOWN = 1e6  # variance of what is not estimated
-HEIGHT = 1.7  # m, of a marker
-COLOURS = {"meant": (0.1, 0.8, 0.2, 0.9), "person": (0.2, 0.4, 1.0, 0.8), "perhaps": (0.6, 0.6, 0.6, 0.4)}
+CLOCK_RESET_S = 1.0
+"""A scan that is older than the previous one by this time means that the clock was set back."""
+UNKNOWN_VARIANCE = 1e6
+"""Variance of quantities that are not estimated."""
+MARKER_HEIGHT_M = 1.7
+MARKER_RGBA = {
+    "selected": (0.1, 0.8, 0.2, 0.9),
+    "person": (0.2, 0.4, 1.0, 0.8),
+    "perhaps": (0.6, 0.6, 0.6, 0.4),
+}
 
 
 def _parameter(default: Any, description: str) -> Any:
+    """Return an attrs field of a node parameter."""
     return attrs.field(default=default, metadata={"description": description})
 
 
 @attrs.frozen
 class PersonTrackerParameters:
-    """The node's parameters."""
+    """Parameters of the node `person_tracker`.
 
-    model: str = _parameter("", "file of the network that knows legs, ONNX; empty: the shipped one")
+    Raises:
+        ValueError: A number is not finite.
+    """
+
+    model: str = _parameter("", "ONNX file of the leg classifier; empty: the shipped one")
     use_odom: bool = _parameter(
-        True, "whether the robot's pose comes on odom; else tracks are in the frame of the scans"
+        True, "whether the robot's pose comes from odom; else tracks are in the frame of the scans"
     )
-    laser_x: float = _parameter(0.25, "where the laser is on the robot: forward, m; as in the shipped worlds")
-    laser_y: float = _parameter(0.0, "where the laser is on the robot: to the left, m")
-    laser_yaw: float = _parameter(0.0, "where the laser looks on the robot: to the left, rad")
+    laser_x: float = _parameter(
+        0.25, "position of the laser on the robot: forward, m; as in the shipped worlds"
+    )
+    laser_y: float = _parameter(0.0, "position of the laser on the robot: left, m")
+    laser_yaw: float = _parameter(0.0, "yaw of the laser on the robot, rad")
     select_nearest: bool = _parameter(
-        True, "whether the nearest person ahead is meant until select_person says who"
+        True, "whether the nearest person ahead is selected until select_person is called"
     )
 
     def __attrs_post_init__(self) -> None:
@@ -62,12 +75,16 @@ class PersonTrackerParameters:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a finite number")
 
     def make_detector(self) -> LegDetector:
-        """Raises ValueError for a file that is no such network."""
+        """Load the leg detector.
+
+        Returns:
+            The detector. Its ValueError for a wrong file propagates.
+        """
         return LegDetector(Path(self.model) if self.model else SHIPPED_MODEL)
 
 
 class PersonTrackerNode(Node):
-    """A scan waits until the odometry has passed its time, for at most some scans."""
+    """ROS node around a PersonTracker; a scan waits until newer odometry has arrived."""
 
     def __init__(self) -> None:
         super().__init__("person_tracker")
@@ -82,8 +99,8 @@ class PersonTrackerNode(Node):
         self._tracks: list[Track] = []
         self._pose = np.zeros(3)
         self._refusals = Refusals()
-        self._used, self._reported, self._refused = 0, 0, 0
-        self._person = self.create_publisher(PoseStamped, "person", 10)
+        self._scan_count, self._scan_count_before, self._refused_before = 0, 0, 0
+        self._person_message = self.create_publisher(PoseStamped, "person", 10)
         self._odometry = self.create_publisher(Odometry, "person/odometry", 10)
         self._persons = self.create_publisher(Persons, "persons", 10)
         self._markers = self.create_publisher(MarkerArray, "person_tracker/markers", 10)
@@ -102,18 +119,19 @@ class PersonTrackerNode(Node):
             return
         self._frame = message.header.frame_id
         while self._waiting and seconds(self._waiting[0].header.stamp) <= self._poses.newest:
-            self._use(self._waiting.popleft())
+            self._track_scan(self._waiting.popleft())
 
     def _on_scan(self, message: Any) -> None:
         if self._settings.use_odom:
             self._waiting.append(message)
         else:
             self._frame = message.header.frame_id
-            self._use(message)
+            self._track_scan(message)
 
-    def _use(self, message: Any) -> None:
+    def _track_scan(self, message: Any) -> None:
+        """Update the tracker with a scan message and publish the result."""
         time = seconds(message.header.stamp)
-        if time < self._time - SET_BACK:
+        if time < self._time - CLOCK_RESET_S:
             self._tracker = PersonTracker(detector=self._detector)
         try:
             pose = self._poses.sensor_at(time) if self._settings.use_odom else None
@@ -128,41 +146,48 @@ class PersonTrackerNode(Node):
             self._refusals.add("scan", MessageError(str(error)))
             return
         self._time, self._pose = time, np.zeros(3) if pose is None else pose
-        self._used += 1
-        meant = self._selection.update(time, self._tracks, self._pose.tolist())
-        self._publish(message.header.stamp, meant)
+        self._scan_count += 1
+        selected = self._selection.update(time, self._tracks, self._pose.tolist())
+        self._publish(message.header.stamp, selected)
 
-    def _publish(self, stamp: Any, meant: Track | None) -> None:
-        if meant is not None:
-            odometry = Odometry(child_frame_id=f"person_{meant.id}")
+    def _publish(self, stamp: Any, selected: Track | None) -> None:
+        """Publish the selected person, all people and the markers."""
+        if selected is not None:
+            odometry = Odometry(child_frame_id=f"person_{selected.id}")
             odometry.header.stamp, odometry.header.frame_id = stamp, self._frame
-            _fill_odometry(odometry, meant)
+            _fill_odometry(odometry, selected)
             self._odometry.publish(odometry)
-            self._person.publish(PoseStamped(header=odometry.header, pose=odometry.pose.pose))
+            self._person_message.publish(PoseStamped(header=odometry.header, pose=odometry.pose.pose))
         self._persons.publish(self._all_persons(stamp))
-        self._markers.publish(self._all_markers(stamp, meant))
+        self._markers.publish(self._all_markers(stamp, selected))
 
     def _all_persons(self, stamp: Any) -> Any:
-        """Those who are confirmed."""
-        message = Persons(persons=[_person(track) for track in self._tracks if track.confirmed])
+        """Return the message of all confirmed people."""
+        message = Persons(persons=[_person_message(track) for track in self._tracks if track.confirmed])
         message.header.stamp, message.header.frame_id = stamp, self._frame
         return message
 
-    def _all_markers(self, stamp: Any, meant: Track | None) -> Any:
-        """A column for each track and its id above, in place of those before."""
+    def _all_markers(self, stamp: Any, selected: Track | None) -> Any:
+        """Return markers that replace the previous ones: a column with an id for each track."""
         markers = [Marker(action=Marker.DELETEALL)]
         for track in self._tracks:
-            kind = "meant" if meant and track.id == meant.id else "person" if track.confirmed else "perhaps"
+            kind = (
+                "selected"
+                if selected and track.id == selected.id
+                else "person"
+                if track.confirmed
+                else "perhaps"
+            )
             for shape, size, height in (
-                (Marker.CYLINDER, 0.4, 0.5 * HEIGHT),
-                (Marker.TEXT_VIEW_FACING, 0.3, HEIGHT + 0.2),
+                (Marker.CYLINDER, 0.4, 0.5 * MARKER_HEIGHT_M),
+                (Marker.TEXT_VIEW_FACING, 0.3, MARKER_HEIGHT_M + 0.2),
             ):
                 marker = Marker(ns="body" if shape == Marker.CYLINDER else "id", id=track.id, type=shape)
                 marker.pose.position.x, marker.pose.position.y = track.position.tolist()
                 marker.pose.position.z, marker.pose.orientation.w = height, 1.0
                 marker.scale.x = marker.scale.y = size
-                marker.scale.z = HEIGHT if shape == Marker.CYLINDER else size
-                marker.color.r, marker.color.g, marker.color.b, marker.color.a = COLOURS[kind]
+                marker.scale.z = MARKER_HEIGHT_M if shape == Marker.CYLINDER else size
+                marker.color.r, marker.color.g, marker.color.b, marker.color.a = MARKER_RGBA[kind]
                 marker.text = str(track.id)
                 markers.append(marker)
         for marker in markers:
@@ -170,20 +195,24 @@ class PersonTrackerNode(Node):
         return MarkerArray(markers=markers)
 
     def _on_select(self, request: Any, response: Any) -> Any:
+        """Select the person that the request names."""
         pose = self._pose - [0.0, 0.0, self._settings.laser_yaw]
         try:
             response.selected = self._selection.select(request.id, self._tracks, pose.tolist()).id
         except ValueError as error:
             response.success, response.message = False, str(error)
         else:
-            response.success, response.message = True, f"person {response.selected} is meant now"
+            response.success, response.message = True, f"person {response.selected} is selected"
             self.get_logger().info(response.message)
         return response
 
     def _report(self) -> None:
-        """Once a second: how the last second went."""
-        used, refused = self._used - self._reported, self._refusals.total - self._refused
-        self._reported, self._refused = self._used, self._refusals.total
+        """Publish the diagnostics of the last second."""
+        used, refused = (
+            self._scan_count - self._scan_count_before,
+            self._refusals.total - self._refused_before,
+        )
+        self._scan_count_before, self._refused_before = self._scan_count, self._refusals.total
         if refused:
             level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
             self.get_logger().warning(summary, throttle_duration_sec=QUIET)
@@ -192,7 +221,7 @@ class PersonTrackerNode(Node):
         elif self._waiting:
             level, summary = (
                 DiagnosticStatus.WARN,
-                "scans wait for odom, which does not come; without odometry set use_odom to false",
+                "scans wait for odom, but none arrives; without odometry set use_odom to false",
             )
         else:
             level, summary = DiagnosticStatus.WARN, "no scan in the last second"
@@ -202,13 +231,13 @@ class PersonTrackerNode(Node):
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
 
 
-def _person(track: Track) -> Any:
+def _person_message(track: Track) -> Any:
     (x, y), (vx, vy) = track.position.tolist(), track.velocity.tolist()
     return Person(id=track.id, x=x, y=y, vx=vx, vy=vy, deviation=track.deviation)
 
 
 def _fill_odometry(message: Any, track: Track) -> None:
-    """Position, the direction in which it walks, and velocity in the person's own frame, x ahead."""
+    """Fill position, direction of walking, and velocity in the person's own frame with x ahead."""
     speed, heading = float(np.hypot(*track.velocity)), float(np.arctan2(track.velocity[1], track.velocity[0]))
     message.pose.pose.position.x, message.pose.pose.position.y = track.position.tolist()
     message.pose.pose.orientation.z, message.pose.pose.orientation.w = (
@@ -216,7 +245,7 @@ def _fill_odometry(message: Any, track: Track) -> None:
         np.cos(heading / 2),
     )
     message.twist.twist.linear.x = speed
-    place, motion = np.diag([UNKNOWN] * 6), np.diag([UNKNOWN] * 6)
+    place, motion = np.diag([UNKNOWN_VARIANCE] * 6), np.diag([UNKNOWN_VARIANCE] * 6)
     c, s = np.cos(heading), np.sin(heading)
     turn = np.array([[c, s], [-s, c]])
     place[:2, :2], motion[:2, :2] = track.covariance[:2, :2], turn @ track.covariance[2:, 2:] @ turn.T
@@ -224,5 +253,9 @@ def _fill_odometry(message: Any, track: Track) -> None:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the node."""
+    """Run the node `person_tracker`.
+
+    Args:
+        args: Command line arguments, those of ROS included; None: `sys.argv`.
+    """
     run(PersonTrackerNode, args)

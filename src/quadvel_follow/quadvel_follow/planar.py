@@ -1,4 +1,4 @@
-"""What messages say of poses, velocities and scans in the plane."""
+"""Planar poses, velocities and ranges from ROS messages."""
 
 from __future__ import annotations
 
@@ -13,18 +13,39 @@ Array = NDArray[np.float64]
 
 
 def planar_pose(pose: Any) -> tuple[float, float, float]:
-    """x, y (m) and yaw (rad) of a geometry_msgs/Pose."""
+    """Extract the planar pose.
+
+    Args:
+        pose: A geometry_msgs/Pose.
+
+    Returns:
+        x, y in m, yaw in rad.
+    """
     turn = pose.orientation
     return pose.position.x, pose.position.y, float(yaw(np.array([turn.w, turn.x, turn.y, turn.z])))
 
 
 def planar_twist(twist: Any) -> tuple[float, float, float]:
-    """vx, vy (m/s) and wz (rad/s) of a geometry_msgs/Twist."""
+    """Extract the planar velocity.
+
+    Args:
+        twist: A geometry_msgs/Twist.
+
+    Returns:
+        vx, vy in m/s, wz in rad/s.
+    """
     return twist.linear.x, twist.linear.y, twist.angular.z
 
 
 def scan_ranges(message: Any) -> Array:
-    """Of a sensor_msgs/LaserScan, (rays,) m; inf where a range is none within the scanner's limits."""
+    """Extract the ranges.
+
+    Args:
+        message: A sensor_msgs/LaserScan.
+
+    Returns:
+        Ranges, (rays,), m; inf outside the limits of the scanner.
+    """
     ranges = np.array(message.ranges, float)
     ranges[~((ranges >= message.range_min) & (ranges < message.range_max))] = np.inf
     return ranges

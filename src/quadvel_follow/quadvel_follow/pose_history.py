@@ -1,4 +1,4 @@
-"""Where the robot was at the time of a scan, from odometry that comes in between."""
+"""Interpolated poses of robot and sensor from recent odometry."""
 
 from __future__ import annotations
 
@@ -10,39 +10,62 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-KEPT = 3.0  # s of poses
+MAX_AGE_S = 3.0
+"""Time for which poses are kept."""
 
 
 class PoseHistory:
-    """Poses x, y (m), yaw (rad) of the robot over time, and those of a sensor that is mounted on it."""
+    """Recent poses of the robot, and of a sensor mounted on it."""
 
     def __init__(self, mounting: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        """mounting: the sensor's pose x, y, yaw on the robot."""
+        """Create an empty history.
+
+        Args:
+            mounting: Pose of the sensor on the robot, (3,): x, y in m, yaw in rad.
+        """
         self._mounting = np.asarray(mounting, float)
         self._times: list[float] = []
         self._poses: list[Array] = []
 
     @property
     def newest(self) -> float:
-        """Time of the newest pose, s; minus infinity where there is none."""
+        """Time of the newest pose, s; minus infinity if there is none."""
         return self._times[-1] if self._times else -np.inf
 
     def add(self, time: float, pose: Sequence[float]) -> None:
-        """A pose of the robot at `time` (s); one that is older than the newest begins anew, as after a reset."""
+        """Add a pose; one that is not newer clears the history, as after a reset.
+
+        Args:
+            time: Time of the pose, s.
+            pose: Pose of the robot, (3,): x, y in m, yaw in rad.
+
+        Raises:
+            ValueError: A number is not finite.
+        """
         found = np.asarray(pose, float)
         if not (np.isfinite(time) and np.isfinite(found).all()):
             raise ValueError(f"pose is {list(pose)} at {time} s, expected finite numbers")
         if time <= self.newest:
             self._times, self._poses = [], []
-        if self._poses:  # turns are counted on, so that they can be interpolated
+        if self._poses:  # unwrapped yaw can be interpolated
             found[2] = np.unwrap([self._poses[-1][2], found[2]])[1]
         self._times.append(time)
         self._poses.append(found)
-        stale = bisect_left(self._times, time - KEPT)
+        stale = bisect_left(self._times, time - MAX_AGE_S)
         del self._times[:stale], self._poses[:stale]
 
     def sensor_at(self, time: float) -> Array:
-        """Pose (3,) of the sensor at `time`. Raises ValueError outside the times that are known."""
+        """Interpolate the pose of the sensor.
+
+        Args:
+            time: Time, s.
+
+        Returns:
+            Pose of the sensor, (3,): x, y in m, yaw in rad (not wrapped).
+
+        Raises:
+            ValueError: The time is outside the history.
+        """
         if not self._times or not self._times[0] <= time <= self._times[-1]:
             known = f"{self._times[0]:.3f} to {self._times[-1]:.3f}" if self._times else "none"
             raise ValueError(f"time is {time:.3f} s, expected one of the poses' times, {known}")

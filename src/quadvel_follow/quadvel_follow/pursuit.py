@@ -1,39 +1,53 @@
-"""Ways that may be good: straight towards a goal, or along a lane beside that line, at several speeds. They see no obstacles."""
+"""Pure-pursuit candidates: straight to a goal or along parallel lanes, at several speeds.
+
+They ignore obstacles; the search rates them.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .rollouts import STEP, STEPS, Limits
+from .rollouts import STEP_S, STEPS, Limits
 
 Array = NDArray[np.float64]
 
-LANES = np.array([0.0, 0.12, -0.12, 0.25, -0.25, 0.45, -0.45, 0.8, -0.8])  # m, to the left of the line
-SHARES = np.array([1.0, 0.7, 0.4])  # of the speed
-AHEAD = 0.8  # m, along the lane, to where the robot looks
-CLOSES = 1.2  # 1/s, of the distance that is too large
-TURNS = 2.5  # 1/s, of the heading
+LANE_OFFSETS_M = np.array([0.0, 0.12, -0.12, 0.25, -0.25, 0.45, -0.45, 0.8, -0.8])
+"""Lateral offsets of the lanes from the straight line, positive to the left."""
+SPEED_SHARES = np.array([1.0, 0.7, 0.4])
+LOOKAHEAD_M = 0.8
+"""Lookahead distance along the lane."""
+DISTANCE_GAIN = 1.2
+"""Speed by distance error, 1/s."""
+HEADING_GAIN = 2.5
+"""Turn rate by heading error, 1/s."""
 
 
 def pursue(pose: Array, goal: Array, left: Array, speed: float, limits: Limits) -> Array:
-    """Targets (lanes x shares, STEPS, 3) from `pose` (3,).
+    """Compute candidate targets that lead to a goal.
 
-    goal (2,): m; left (STEPS,): m that are left to walk at the start, as they are at each step where the goal walks;
-    speed: m/s, of the goal.
+    Args:
+        pose: Pose of the robot, (3,): x, y in m, yaw in rad.
+        goal: Goal, (2,), m.
+        left: Distance left to the goal from the start, at each step of a moving goal, (STEPS,), m.
+        speed: Speed of the goal, m/s.
+        limits: Limits of the commands.
+
+    Returns:
+        Targets, (lanes x speeds, STEPS, 3): vx, vy in m/s, wz in rad/s.
     """
-    lane, share = (each.ravel() for each in np.meshgrid(LANES, SHARES, indexing="ij"))
+    lane, share = (each.ravel() for each in np.meshgrid(LANE_OFFSETS_M, SPEED_SHARES, indexing="ij"))
     off = goal - pose[:2]
     direction = np.arctan2(off[1], off[0])
     along, aside, yaw = np.zeros_like(lane), np.zeros_like(lane), np.full_like(lane, pose[2] - direction)
     found = np.zeros((len(lane), STEPS, 3))
     for step in range(STEPS):
-        turn = np.arctan2(lane - aside, AHEAD) - yaw
+        turn = np.arctan2(lane - aside, LOOKAHEAD_M) - yaw
         turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
-        pace = share * np.maximum(speed + CLOSES * (left[step] - along), 0.0)
+        pace = share * np.maximum(speed + DISTANCE_GAIN * (left[step] - along), 0.0)
         pace *= np.maximum(np.cos(turn), 0.0) ** 4
-        found[:, step] = limits.held(np.column_stack([pace, np.zeros_like(pace), TURNS * turn]))
-        yaw = yaw + STEP * found[:, step, 2]
-        along = along + STEP * found[:, step, 0] * np.cos(yaw)
-        aside = aside + STEP * found[:, step, 0] * np.sin(yaw)
+        found[:, step] = limits.clip(np.column_stack([pace, np.zeros_like(pace), HEADING_GAIN * turn]))
+        yaw = yaw + STEP_S * found[:, step, 2]
+        along = along + STEP_S * found[:, step, 0] * np.cos(yaw)
+        aside = aside + STEP_S * found[:, step, 0] * np.sin(yaw)
     return found

@@ -1,4 +1,4 @@
-"""What becomes of a robot that is commanded velocities: how fast commands may change, and how the robot follows them."""
+"""Prediction of the robot's motion under velocity commands: limits, first-order lag, and poses."""
 
 from __future__ import annotations
 
@@ -9,17 +9,22 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 Axes = tuple[float, float, float]
 
-STEP = 0.125  # s
+STEP_S = 0.125
 STEPS = 14
-LAG = 0.2  # s, from a command to the robot's velocity: its delay and its first-order lag together
+LAG_S = 0.2
+"""Time constant from command to velocity: delay and first-order lag together."""
 
 
 @attrs.frozen
 class Limits:
-    """Of commands, each for vx, vy (m/s), wz (rad/s).
+    """Limits of the commands vx, vy (m/s), wz (rad/s).
 
-    velocity: vx and vy keep to an ellipse; backward: m/s, largest -vx; curve: m/s^2, largest |wz| (|vx| + |vy|);
-    acceleration, deceleration: largest change of a command away from zero, and towards it.
+    Attributes:
+        velocity: Largest magnitudes; vx and vy are limited by an ellipse.
+        backward: Largest backward speed, m/s.
+        curve: Largest |wz| (|vx| + |vy|), m/s^2.
+        acceleration: Largest rates of change away from zero, m/s^2, m/s^2, rad/s^2.
+        deceleration: Largest rates of change toward zero, m/s^2, m/s^2, rad/s^2.
     """
 
     velocity: Axes
@@ -28,8 +33,15 @@ class Limits:
     acceleration: Axes
     deceleration: Axes
 
-    def held(self, commands: ArrayLike) -> Array:
-        """Commands (..., 3) held to these limits."""
+    def clip(self, commands: ArrayLike) -> Array:
+        """Clip commands to the limits of velocity.
+
+        Args:
+            commands: Commands, (..., 3).
+
+        Returns:
+            Clipped commands, (..., 3).
+        """
         found = np.clip(commands, np.negative(self.velocity), self.velocity)
         found[..., 0] = np.maximum(found[..., 0], -self.backward)
         out = np.hypot(found[..., 0] / self.velocity[0], found[..., 1] / self.velocity[1])
@@ -38,8 +50,17 @@ class Limits:
         found[..., 2] = np.clip(found[..., 2], -turn, turn)
         return found
 
-    def ramped(self, before: Array, target: Array, seconds: float) -> Array:
-        """From the commands `before` (..., 3) towards `target` (..., 3), as far as `seconds` allow."""
+    def ramp(self, before: Array, target: Array, seconds: float) -> Array:
+        """Move commands toward targets within the limits of acceleration.
+
+        Args:
+            before: Present commands, (..., 3).
+            target: Targets, (..., 3).
+            seconds: Time, s.
+
+        Returns:
+            Commands after that time, (..., 3).
+        """
         slower = np.abs(target) < np.abs(before)
         step = seconds * np.where(slower, self.deceleration, self.acceleration)
         return before + np.clip(target - before, -step, step)
@@ -47,39 +68,60 @@ class Limits:
 
 @attrs.frozen
 class Rollouts:
-    """commands, velocity (K, STEPS, 3): vx, vy (m/s), wz (rad/s), body frame; poses (K, STEPS, 3): x, y (m), yaw (rad)."""
+    """Predicted motions for K sequences of targets.
+
+    Attributes:
+        commands: Commands, (K, STEPS, 3): vx, vy in m/s, wz in rad/s, body frame.
+        velocity: Velocities of the robot, as `commands`.
+        poses: Poses, (K, STEPS, 3): x, y in m, yaw in rad.
+    """
 
     commands: Array
     velocity: Array
     poses: Array
 
 
-_AGO = np.arange(STEPS)[:, None] - np.arange(STEPS)
-_KEPT = np.exp(-STEP / LAG)
-_FOLLOWS = np.where(_AGO >= 0, (1.0 - _KEPT) * _KEPT ** np.maximum(_AGO, 0), 0.0)  # (STEPS, STEPS)
-_STAYS = _KEPT ** np.arange(1, STEPS + 1)
-TIMES = STEP * np.arange(1, STEPS + 1)
-"""(STEPS,) s, of the poses."""
+# First-order lag in closed form, with a = exp(-dt / LAG_S):
+# v_t = sum_{s <= t} (1 - a) a^(t - s) u_s + a^(t + 1) v_0.
+_STEPS_AGO = np.arange(STEPS)[:, None] - np.arange(STEPS)
+_DECAY = np.exp(-STEP_S / LAG_S)
+_RESPONSE = np.where(
+    _STEPS_AGO >= 0, (1.0 - _DECAY) * _DECAY ** np.maximum(_STEPS_AGO, 0), 0.0
+)  # (STEPS, STEPS)
+_INITIAL_DECAY = _DECAY ** np.arange(1, STEPS + 1)
+TIMES_S = STEP_S * np.arange(1, STEPS + 1)
+"""Times of the poses, (STEPS,)."""
 
 
 def roll_out(targets: Array, pose: Array, velocity: Array, command: Array, limits: Limits) -> Rollouts:
-    """targets (K, STEPS, 3): the commands wanted; pose, velocity, command (3,): now."""
+    """Predict the motion for sequences of targets.
+
+    Args:
+        targets: Targets, (K, STEPS, 3): vx, vy in m/s, wz in rad/s.
+        pose: Present pose, (3,).
+        velocity: Present velocity, (3,).
+        command: Present command, (3,).
+        limits: Limits of the commands.
+
+    Returns:
+        The rollouts.
+    """
     commands = np.empty_like(targets)
     last = np.broadcast_to(command, targets[:, 0].shape)
     for step in range(STEPS):
-        last = limits.ramped(last, targets[:, step], STEP)
+        last = limits.ramp(last, targets[:, step], STEP_S)
         commands[:, step] = last
-    followed = np.einsum("ts,ksa->kta", _FOLLOWS, commands) + _STAYS[:, None] * velocity
+    followed = np.einsum("ts,ksa->kta", _RESPONSE, commands) + _INITIAL_DECAY[:, None] * velocity
     return Rollouts(commands, followed, _poses(followed, pose, velocity))
 
 
 def _poses(followed: Array, pose: Array, velocity: Array) -> Array:
-    """Velocities (K, STEPS, 3) at the ends of the steps, added up."""
+    """Integrate velocities (K, STEPS, 3) with the midpoint rule."""
     before = np.concatenate([np.broadcast_to(velocity, followed[:, :1].shape), followed[:, :-1]], axis=1)
     mean = 0.5 * (before + followed)
-    yaw = pose[2] + STEP * np.cumsum(mean[..., 2], axis=1)
-    middle = yaw - 0.5 * STEP * mean[..., 2]
+    yaw = pose[2] + STEP_S * np.cumsum(mean[..., 2], axis=1)
+    middle = yaw - 0.5 * STEP_S * mean[..., 2]
     c, s = np.cos(middle), np.sin(middle)
-    x = pose[0] + STEP * np.cumsum(c * mean[..., 0] - s * mean[..., 1], axis=1)
-    y = pose[1] + STEP * np.cumsum(s * mean[..., 0] + c * mean[..., 1], axis=1)
+    x = pose[0] + STEP_S * np.cumsum(c * mean[..., 0] - s * mean[..., 1], axis=1)
+    y = pose[1] + STEP_S * np.cumsum(s * mean[..., 0] + c * mean[..., 1], axis=1)
     return np.stack([x, y, yaw], axis=-1)

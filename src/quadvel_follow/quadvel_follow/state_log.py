@@ -1,57 +1,62 @@
-"""What the log says of a state that may change many times a second: what lasts, and a summary of what does not. No ROS."""
+"""Log lines about a changing state: lasting states, and a summary of short ones. No ROS."""
 
 from __future__ import annotations
 
 from collections import Counter
 
 SETTLED_S = 1.0
-"""s, that a state lasts before it has a line of its own"""
+"""Time after which a state is logged as a lasting one."""
 FLAPPING_S = 10.0
-"""s of changes without a state that lasts, after which a line sums them up"""
+"""Time of changes without a lasting state after which a summary is logged."""
 
 
 class StateLog:
-    """Lines for the log, from the text of the state at each step."""
+    """Limits the log lines about the state of a node."""
 
     def __init__(self) -> None:
         self._text, self._since = "", 0.0
         self._logged = ""
-        self._passing: Counter[str] = Counter()  # texts since the last line, by how often they began
-        self._began = 0.0  # s, when the first of these came
+        self._short_states: Counter[str] = Counter()  # texts since the last line, by how often they began
+        self._short_states_since = 0.0  # s, when the first of these came
 
-    def line(self, now: float, text: str) -> str:
-        """The line that is due, or "".
+    def next_line(self, now: float, text: str) -> str:
+        """Return the line that is due.
 
         Args:
-            now: s, on a clock that is not set back.
-            text: the state, as people read it.
+            now: Present time on a clock that is not set back, s.
+            text: Present state.
+
+        Returns:
+            The line, or "".
         """
         if text != self._text:
-            if not self._passing:
-                self._began = now
+            if not self._short_states:
+                self._short_states_since = now
             self._text, self._since = text, now
-            self._passing[text] += 1
+            self._short_states[text] += 1
         if now - self._since >= SETTLED_S:
             return self._settled()
-        return self._summary() if self._passing and now - self._began >= FLAPPING_S else ""
+        return self._summary() if self._short_states and now - self._short_states_since >= FLAPPING_S else ""
 
     def _settled(self) -> str:
-        """The state that lasts, unless it has its line already, with what passed before it."""
+        """Return the line of a lasting state and the short states before it, unless logged."""
         is_new = self._text != self._logged
-        self._passing[self._text] -= 1
-        passed = self._passed()
-        self._passing.clear()
+        self._short_states[self._text] -= 1
+        passed = self._short_states_text()
+        self._short_states.clear()
         self._logged = self._text
         if not (is_new or passed):
             return ""
         return f"{self._text} (before that, for moments: {passed})" if passed else self._text
 
     def _summary(self) -> str:
-        passed = self._passed()
-        self._passing.clear()
-        self._passing[self._text], self._began = 0, self._since
+        """Return the line that summarizes short states."""
+        passed = self._short_states_text()
+        self._short_states.clear()
+        self._short_states[self._text], self._short_states_since = 0, self._since
         self._logged = ""
         return f"changes all the time: {passed}"
 
-    def _passed(self) -> str:
-        return ", ".join(f"{count}x {text}" for text, count in self._passing.items() if count > 0)
+    def _short_states_text(self) -> str:
+        """Return the short states with their counts."""
+        return ", ".join(f"{count}x {text}" for text, count in self._short_states.items() if count > 0)

@@ -1,4 +1,4 @@
-"""The way that a person walked, which a robot can take where it does not see the person."""
+"""Trail of a walking person: a path for the robot while it does not see the person."""
 
 from __future__ import annotations
 
@@ -9,23 +9,27 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-STEP = 0.15  # m, from one point to the next
-LONGEST = 10.0  # m
+POINT_SPACING_M = 0.15  # m, from one point to the next
+MAX_LENGTH_M = 10.0  # m
 
 
 class Trail:
-    """Points from the oldest to the newest, m, in the frame of the odometry."""
+    """Points of the trail in the odometry frame, oldest first."""
 
     def __init__(self) -> None:
-        self._points: deque[Array] = deque(maxlen=round(LONGEST / STEP))
+        self._points: deque[Array] = deque(maxlen=round(MAX_LENGTH_M / POINT_SPACING_M))
 
     def add(self, place: ArrayLike) -> None:
-        """Where the person is seen now, (2,) m."""
+        """Add the present position of the person.
+
+        Args:
+            place: Position, (2,), m.
+        """
         found = np.asarray(place, float)
-        if not self._points or np.hypot(*(found - self._points[-1])) >= STEP:
+        if not self._points or np.hypot(*(found - self._points[-1])) >= POINT_SPACING_M:
             self._points.append(found)
 
     @property
     def points(self) -> Array:
-        """(n, 2)."""
+        """Points, (n, 2), m."""
         return np.array(self._points).reshape(-1, 2)

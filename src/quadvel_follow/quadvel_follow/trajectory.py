@@ -1,4 +1,4 @@
-"""Ways that are written down, and walking them: in open loop, velocity over time, or closed on the odometry. No ROS."""
+"""Trajectories from files and their execution in open or closed loop. No ROS."""
 
 from __future__ import annotations
 
@@ -11,61 +11,85 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .path_smoothing import EXACT_M, FEW_POINTS, NoiseLimits, smooth_path, turns_of
+from .path_smoothing import EXACT_NOISE_M, FEW_POINTS, NoiseLimits, smooth_path, turn_angles
 
 Array = NDArray[np.float64]
 
-STEP = 0.02  # s, between the rows of a trajectory
-EARTH = 6371008.8  # m, mean radius
-LARGEST = 10_000_000  # bytes of a file
-SAME = 1e-6  # m, within which two points are one
-TURN_RATE = 1.0  # rad/s, at most, on the spot and in curves
-LONGEST = 86_400.0  # s, of a trajectory: a day
-FURTHEST = 100_000.0  # m, of a trajectory
-LONGEST_STEP = 10_000.0  # m, between two points
+STEP_S = 0.02
+"""Time between the rows of a trajectory."""
+EARTH_RADIUS_M = 6371008.8
+"""Mean radius."""
+MAX_FILE_BYTES = 10_000_000
+SAME_POINT_M = 1e-6
+"""Distance within which two points are one."""
+MAX_TURN_RATE = 1.0
+"""Turn rate on the spot and in curves, rad/s."""
+MAX_DURATION_S = 86_400.0
+"""A day."""
+MAX_LENGTH_M = 100_000.0
+MAX_STEP_M = 10_000.0
+"""Largest distance between two points."""
 LEAP_STEPS, LEAP_M = 20.0, 20.0
-"""Usual steps and metres from which a step of a recorded path is a leap"""
-TABLE_NOISE = NoiseLimits(least=EXACT_M, few=0.1, many=0.5)
-"""Of x and y in a CSV file: odometry, a map, motion capture, radio beacons"""
+"""Multiples of the usual step, and distance, from which a step of a recorded path is a leap."""
+TABLE_NOISE = NoiseLimits(least=EXACT_NOISE_M, few=0.1, many=0.5)
+"""Noise of x and y in a CSV file: odometry, a map, motion capture, radio beacons."""
 RECEIVER_NOISE = NoiseLimits(least=0.3, few=1.0, many=5.0, shared=1.0)
-"""Of the points of a GPX track; a receiver's error wanders by some 0.3 m even where neighbours agree, and by no less in a mean"""
-CORRECTS = np.array([1.0, 1.0, 1.5])  # 1/s, of what the robot is off: ahead, to the left, turned
-CORRECTS_AT_MOST = np.array([0.3, 0.3, 0.5])  # m/s, m/s, rad/s
-LOST = 1.0  # m, off the way, from which a robot stops
-SHIPPED = Path(__file__).parent / "trajectories"
+"""Noise of a GPX track; averaging does not remove a receiver's drift of about 0.3 m."""
+CORRECTION_GAINS = np.array([1.0, 1.0, 1.5])  # 1/s, for deviations ahead, to the left, in yaw
+MAX_CORRECTION = np.array([0.3, 0.3, 0.5])  # m/s, m/s, rad/s
+MAX_DEVIATION_M = 1.0
+"""Deviation from the trajectory at which the robot stops."""
+SHIPPED_FOLDER = Path(__file__).parent / "trajectories"
 """zju.csv and eight.csv."""
 
 
 @attrs.frozen
 class Trajectory:
-    """A row each `STEP`, from a start at the origin that looks along x.
+    """Trajectory with a row every `STEP_S`, from a start at the origin facing along x.
 
-    pose (n, 3): x, y (m), yaw (rad); velocity (n, 3): vx, vy (m/s), wz (rad/s), body frame.
+    Attributes:
+        pose: Poses, (n, 3): x, y in m, yaw in rad.
+        velocity: Velocities in the body frame, (n, 3): vx, vy in m/s, wz in rad/s.
+        noise: Position noise of the file that was smoothed away, m, per axis.
     """
 
     pose: Array
     velocity: Array
 
     noise: float = 0.0
-    """m, one axis, of the points of the file, which the trajectory leaves out"""
 
     @property
     def seconds(self) -> float:
         """Duration, s."""
-        return len(self.pose) * STEP
+        return len(self.pose) * STEP_S
 
     def summary(self) -> str:
-        """Length, duration and turning, in one sentence."""
+        """Describe the trajectory in one sentence.
+
+        Returns:
+            Length, duration and turning.
+        """
         speed, turning = np.hypot(*self.velocity[:, :2].T), np.abs(self.velocity[:, 2])
-        length, turned = STEP * speed.sum(), STEP * turning.sum()
-        on_the_spot = STEP * turning[speed == 0.0].sum()
-        noise = f"; position noise of {self.noise:.2f} m is smoothed away" if self.noise > EXACT_M else ""
+        length, turned = STEP_S * speed.sum(), STEP_S * turning.sum()
+        on_the_spot = STEP_S * turning[speed == 0.0].sum()
+        noise = (
+            f"; position noise of {self.noise:.2f} m is smoothed away" if self.noise > EXACT_NOISE_M else ""
+        )
         return f"{length:.1f} m in {self.seconds:.1f} s, turning {turned:.1f} rad, {on_the_spot:.1f} rad of them on the spot{noise}"
 
     @classmethod
-    def of_commands(cls, seconds: ArrayLike, commands: ArrayLike, step: float = STEP) -> Trajectory:
-        """Velocities (k, 3), each for its seconds (k,), in rows of `step` (s). Raises ValueError beyond LONGEST."""
-        _refuse_long(float(np.sum(seconds)))
+    def from_commands(cls, seconds: ArrayLike, commands: ArrayLike, step: float = STEP_S) -> Trajectory:
+        """Create a trajectory from velocity commands.
+
+        Args:
+            seconds: Duration of each command, (k,), s.
+            commands: Velocities, (k, 3): vx, vy in m/s, wz in rad/s.
+            step: Time between rows, s.
+
+        Returns:
+            The trajectory. ValueError propagates if it is longer than MAX_DURATION_S.
+        """
+        _check_duration(float(np.sum(seconds)))
         counts = np.rint(np.asarray(seconds, float) / step).astype(int)
         velocity = np.repeat(np.asarray(commands, float).reshape(-1, 3), counts, axis=0)
         yaw = np.concatenate([[0.0], np.cumsum(velocity[:, 2]) * step])
@@ -78,83 +102,97 @@ class Trajectory:
         return cls(np.column_stack([place, yaw])[:-1], velocity)
 
     @classmethod
-    def of_places(cls, places: ArrayLike, speed: float, noise: NoiseLimits = TABLE_NOISE) -> Trajectory:
-        """Along places at a speed, looking where it goes: in curves, and turning on the spot at corners.
+    def from_points(cls, places: ArrayLike, speed: float, noise: NoiseLimits = TABLE_NOISE) -> Trajectory:
+        """Create a trajectory along points: arcs in curves, turns on the spot at corners.
 
         Args:
-            places: (k, 2), m, as written or as recorded with noise.
-            speed: m/s; less where a curve is so narrow that the robot would turn faster than TURN_RATE.
-            noise: what noise to believe.
+            places: Points, (k, 2), m, as written or as recorded with noise.
+            speed: Speed, m/s; lower in narrow curves, so that the turn rate is at most
+                MAX_TURN_RATE.
+            noise: Bounds of the position noise.
+
+        Returns:
+            The trajectory.
 
         Raises:
-            ValueError: if there are less than two places, or too long a way.
+            ValueError: There are fewer than two points, or the path is too long.
         """
         points = np.asarray(places, float)
-        points = points[np.concatenate([[True], _lengths(points) > SAME])]
+        points = points[np.concatenate([[True], _step_lengths(points) > SAME_POINT_M])]
         if len(points) < 2:
             raise ValueError("has one place, expected two at least")
         path = smooth_path(points, noise)
-        length = sum(float(_lengths(piece).sum()) for piece in path.pieces)
-        if not length <= FURTHEST:
-            raise ValueError(f"is {length:.3g} m long, expected {FURTHEST:.0f} m at most")
-        _refuse_long(length / speed)
+        length = sum(float(_step_lengths(piece).sum()) for piece in path.pieces)
+        if not length <= MAX_LENGTH_M:
+            raise ValueError(f"is {length:.3g} m long, expected {MAX_LENGTH_M:.0f} m at most")
+        _check_duration(length / speed)
         corners = [
-            float(turns_of(np.array([before[-1] - before[-2], after[1] - after[0]]))[0])
+            float(turn_angles(np.array([before[-1] - before[-2], after[1] - after[0]]))[0])
             for before, after in itertools.pairwise(path.pieces)
         ]
-        rows = [_along(piece, speed) for piece in path.pieces]
+        rows = [_piece_velocities(piece, speed) for piece in path.pieces]
         for i, turn in reversed(list(enumerate(corners))):
-            rows.insert(i + 1, _on_the_spot(turn))
+            rows.insert(i + 1, _turn_velocities(turn))
         velocity = np.concatenate(rows)
-        walked = cls.of_commands(np.full(len(velocity), STEP), velocity)
+        walked = cls.from_commands(np.full(len(velocity), STEP_S), velocity)
         return attrs.evolve(walked, noise=path.noise)
 
 
-def _along(piece: Array, speed: float) -> Array:
-    """Velocities (n, 3), a row each STEP, along points (k, 2) whose bends are walked as arcs from leg to leg."""
+def _piece_velocities(piece: Array, speed: float) -> Array:
+    """Return velocities (n, 3) every STEP_S along points (k, 2); bends become arcs between legs."""
     legs = np.diff(piece, axis=0)
-    lengths, turns = np.hypot(*legs.T), turns_of(legs)
+    lengths, turns = np.hypot(*legs.T), turn_angles(legs)
     cut = 0.5 * np.minimum(lengths[:-1], lengths[1:])  # of both legs, where the arc begins and ends
     half = np.maximum(0.5 * np.abs(turns), 1e-9)
     arcs = 2.0 * cut * half / np.tan(half)
     straights = lengths - np.concatenate([[0.0], cut]) - np.concatenate([cut, [0.0]])
     distance = np.concatenate([np.column_stack([straights[:-1], arcs]).ravel(), straights[-1:]])
     turned = np.concatenate([np.column_stack([np.zeros_like(turns), turns]).ravel(), [0.0]])
-    seconds = np.maximum(distance / speed, np.abs(turned) / TURN_RATE)
-    _refuse_long(float(seconds.sum()))
+    seconds = np.maximum(distance / speed, np.abs(turned) / MAX_TURN_RATE)
+    _check_duration(float(seconds.sum()))
     ends = np.cumsum(seconds)
-    instants = np.linspace(0.0, ends[-1], max(round(ends[-1] / STEP), 1) + 1)
+    instants = np.linspace(0.0, ends[-1], max(round(ends[-1] / STEP_S), 1) + 1)
     ahead, yaw = (
         np.diff(np.interp(instants, [0.0, *ends], [0.0, *np.cumsum(moved)])) for moved in (distance, turned)
     )
-    return np.column_stack([ahead, np.zeros_like(ahead), yaw]) / STEP
+    return np.column_stack([ahead, np.zeros_like(ahead), yaw]) / STEP_S
 
 
-def _on_the_spot(turn: float) -> Array:
-    """Velocities (n, 3), a row each STEP, that turn by that angle, rad."""
-    count = max(round(abs(turn) / TURN_RATE / STEP), 1)
-    return np.tile([0.0, 0.0, turn / (count * STEP)], (count, 1))
+def _turn_velocities(turn: float) -> Array:
+    """Return velocities (n, 3) every STEP_S that turn by an angle in rad on the spot."""
+    count = max(round(abs(turn) / MAX_TURN_RATE / STEP_S), 1)
+    return np.tile([0.0, 0.0, turn / (count * STEP_S)], (count, 1))
 
 
-def _refuse_long(seconds: float) -> None:
-    """Raises ValueError before a trajectory of that duration takes memory."""
-    if not seconds <= LONGEST:
-        raise ValueError(f"lasts {seconds:.3g} s, expected a day ({LONGEST:.0f} s) at most")
+def _check_duration(seconds: float) -> None:
+    """Raise ValueError before a too long trajectory takes memory."""
+    if not seconds <= MAX_DURATION_S:
+        raise ValueError(f"lasts {seconds:.3g} s, expected a day ({MAX_DURATION_S:.0f} s) at most")
 
 
-def load(path: Path, speed: float) -> Trajectory:
-    """From a CSV or GPX file; `speed` (m/s) where it holds places.
+def load_trajectory(path: Path, speed: float) -> Trajectory:
+    """Load a trajectory from a CSV or GPX file.
 
-    CSV: a head of seconds, vx, vy, wz, or of x, y (m). GPX: the points of its tracks and routes, in the plane round the first,
-    turned so that the way begins along x. Raises ValueError that names the file.
+    A CSV file has the columns seconds, vx, vy, wz, or x, y (m). The points of a GPX file are
+    projected to the tangent plane of the first one and turned so that the path begins along x.
+
+    Args:
+        path: Path of the file.
+        speed: Speed for a file of points, m/s.
+
+    Returns:
+        The trajectory.
+
+    Raises:
+        ValueError: The file is unreadable or malformed; the message names it.
     """
     try:
-        if path.stat().st_size > LARGEST:
-            raise ValueError(f"has more than {LARGEST} bytes")
-        read = _gpx if path.suffix.lower() == ".gpx" else _csv
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise ValueError(f"has more than {MAX_FILE_BYTES} bytes")
+        read = _load_gpx if path.suffix.lower() == ".gpx" else _load_csv
         return read(path, speed)
     except OSError as error:
-        shipped = ", ".join(sorted(file.stem for file in SHIPPED.glob("*.csv")))
+        shipped = ", ".join(sorted(file.stem for file in SHIPPED_FOLDER.glob("*.csv")))
         raise ValueError(
             f"{path}: {error.strerror}, expected a CSV or GPX file or one of {shipped}"
         ) from None
@@ -163,19 +201,30 @@ def load(path: Path, speed: float) -> Trajectory:
 
 
 def read_table(path: Path) -> tuple[list[str], Array]:
-    """The head and the numbers (k, columns) of a CSV file. Raises ValueError if it is no such table."""
+    """Read a CSV file.
+
+    Args:
+        path: Path of the file.
+
+    Returns:
+        Column names, and numbers (k, columns).
+
+    Raises:
+        ValueError: The file is malformed.
+    """
     with path.open(newline="") as file:
         rows = list(csv.reader(file))
     head = [name.strip() for name in rows[0]] if rows else []
     if head not in (["seconds", "vx", "vy", "wz"], ["x", "y"]):
         raise ValueError(f"has the head {','.join(head)!r}, expected seconds,vx,vy,wz or x,y")
-    numbers = [_numbers(row, line, len(head)) for line, row in enumerate(rows[1:], 2) if row]
+    numbers = [_parse_numbers(row, line, len(head)) for line, row in enumerate(rows[1:], 2) if row]
     if not numbers:
         raise ValueError(f"has no row below its head, expected {len(head)} finite numbers in each")
     return head, np.array(numbers)
 
 
-def _numbers(row: list[str], line: int, count: int) -> list[float]:
+def _parse_numbers(row: list[str], line: int, count: int) -> list[float]:
+    """Return the numbers of a row."""
     try:
         numbers = [float(cell) for cell in row]
     except ValueError:
@@ -185,17 +234,19 @@ def _numbers(row: list[str], line: int, count: int) -> list[float]:
     return numbers
 
 
-def _csv(path: Path, speed: float) -> Trajectory:
+def _load_csv(path: Path, speed: float) -> Trajectory:
+    """Return the trajectory of a CSV file."""
     head, numbers = read_table(path)
     if len(head) == 2:
-        _refuse_leaps(numbers, _lengths(numbers))
-        return Trajectory.of_places(numbers, speed)
+        _check_leaps(numbers, _step_lengths(numbers))
+        return Trajectory.from_points(numbers, speed)
     if (numbers[:, 0] <= 0.0).any():
         raise ValueError("has seconds that are not above 0")
-    return Trajectory.of_commands(numbers[:, 0], numbers[:, 1:])
+    return Trajectory.from_commands(numbers[:, 0], numbers[:, 1:])
 
 
-def _gpx(path: Path, speed: float) -> Trajectory:
+def _load_gpx(path: Path, speed: float) -> Trajectory:
+    """Return the trajectory of a GPX file."""
     text = path.read_text()
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("has a document type or entities, which no track needs")
@@ -207,70 +258,86 @@ def _gpx(path: Path, speed: float) -> Trajectory:
         raise ValueError("has less than two points with lat and lon")
     if (wrong := np.flatnonzero((np.abs(angles) > [90.0, 360.0]).any(axis=1))).size:
         raise ValueError(
-            f"has point {wrong[0] + 1} at {_pair(angles[wrong[0]])}, expected a lat within 90 and a lon within 360 degrees"
+            f"has point {wrong[0] + 1} at {_pair_text(angles[wrong[0]])}, expected a lat within 90 and a lon within 360 degrees"
         )
-    directions = _from_the_centre(np.deg2rad(angles))
+    directions = _unit_vectors(np.deg2rad(angles))
     chords = np.linalg.norm(np.diff(directions, axis=0), axis=1)
-    _refuse_leaps(angles, 2.0 * EARTH * np.arcsin(np.minimum(0.5 * chords, 1.0)))
+    _check_leaps(angles, 2.0 * EARTH_RADIUS_M * np.arcsin(np.minimum(0.5 * chords, 1.0)))
     lat, lon = np.deg2rad(angles[0])
     east = np.array([-np.sin(lon), np.cos(lon), 0.0])
     north = np.array([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)])
-    places = EARTH * (directions - directions[0]) @ np.column_stack([east, north])
+    places = EARTH_RADIUS_M * (directions - directions[0]) @ np.column_stack([east, north])
     is_track = points[0].tag.rpartition("}")[2] == "trkpt"
-    return Trajectory.of_places(places, speed, RECEIVER_NOISE if is_track else TABLE_NOISE)
+    return Trajectory.from_points(places, speed, RECEIVER_NOISE if is_track else TABLE_NOISE)
 
 
-def _from_the_centre(angles: Array) -> Array:
-    """Unit vectors (n, 3) from the earth's centre to lat, lon (n, 2), rad: they know no poles and no date line."""
+def _unit_vectors(angles: Array) -> Array:
+    """Return unit vectors (n, 3) from the earth's centre to lat, lon (n, 2) in rad.
+
+    They have no singularity at the poles and the date line.
+    """
     lat, lon = angles.T
     return np.column_stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
 
 
-def _lengths(places: Array) -> Array:
-    """Of the steps between places (n, 2), m; infinite where they are beyond all numbers."""
+def _step_lengths(places: Array) -> Array:
+    """Return the distances of consecutive points (n, 2), m; infinite if they overflow."""
     with np.errstate(over="ignore"):
         return np.asarray(np.hypot(*np.diff(places, axis=0).T))
 
 
-def _refuse_leaps(points: Array, steps: Array) -> None:
-    """Raises ValueError that names the points between which a path leaps.
+def _check_leaps(points: Array, steps: Array) -> None:
+    """Raise ValueError that names the points between which a path leaps.
 
     Args:
-        points: (n, 2), as the file has them.
-        steps: (n - 1,), m, between them.
+        points: Points as in the file, (n, 2).
+        steps: Distances between them, (n - 1,), m.
     """
-    usual = float(np.median(steps[steps > SAME])) if (steps > SAME).any() else 0.0
+    usual = float(np.median(steps[steps > SAME_POINT_M])) if (steps > SAME_POINT_M).any() else 0.0
     recorded = len(points) >= FEW_POINTS
-    most = min(max(LEAP_STEPS * usual, LEAP_M), LONGEST_STEP) if recorded else LONGEST_STEP
+    most = min(max(LEAP_STEPS * usual, LEAP_M), MAX_STEP_M) if recorded else MAX_STEP_M
     leaps = np.flatnonzero(steps > most)
     if not len(leaps):
         return
     k = leaps[0]
     more = f"; {len(leaps)} steps of the file are such leaps" if len(leaps) > 1 else ""
     raise ValueError(
-        f"leaps {steps[k]:.6g} m from point {k + 1} at {_pair(points[k])} to point {k + 2} at {_pair(points[k + 1])}, "
+        f"leaps {steps[k]:.6g} m from point {k + 1} at {_pair_text(points[k])} to point {k + 2} at {_pair_text(points[k + 1])}, "
         f"expected {most:.3g} m at most, as a usual step is {usual:.2g} m{more}; remove the wrong points, or fill the gap"
     )
 
 
-def _pair(numbers: Array) -> str:
+def _pair_text(numbers: Array) -> str:
     return f"({numbers[0]:.9g}, {numbers[1]:.9g})"
 
 
 class TrajectoryFollower:
-    """What to command at a time, from where the robot was at the first call."""
+    """Executes a trajectory from the pose of the robot at the first step."""
 
     def __init__(self, trajectory: Trajectory, closed: bool) -> None:
-        """closed: whether what the robot is off, by its odometry, is corrected."""
+        """Start a trajectory.
+
+        Args:
+            trajectory: The trajectory.
+            closed: Whether deviations of the odometry are corrected.
+        """
         self._trajectory, self._closed = trajectory, closed
         self._start: Array | None = None
 
     def step(self, elapsed: float, pose: ArrayLike | None = None) -> Array | None:
-        """vx, vy (m/s), wz (rad/s) after `elapsed` s; None at the end. pose (3,): x, y (m), yaw (rad), where it is closed.
+        """Compute the command.
 
-        Raises ValueError where the robot has strayed too far.
+        Args:
+            elapsed: Time since the start, s.
+            pose: Pose of the robot, (3,): x, y in m, yaw in rad; required in closed loop.
+
+        Returns:
+            Command, (3,): vx, vy in m/s, wz in rad/s; None at the end.
+
+        Raises:
+            ValueError: The robot has deviated more than MAX_DEVIATION_M.
         """
-        row = int(elapsed / STEP)
+        row = int(elapsed / STEP_S)
         if row >= len(self._trajectory.pose):
             return None
         velocity: Array = self._trajectory.velocity[row]
@@ -279,17 +346,17 @@ class TrajectoryFollower:
         now = np.asarray(pose, float)
         if self._start is None:
             self._start = now
-        x, y, yaw = _within(self._start, now)
-        off = _within(np.array([x, y, yaw]), self._trajectory.pose[row])
-        if np.hypot(*off[:2]) > LOST:
+        x, y, yaw = _relative_pose(self._start, now)
+        off = _relative_pose(np.array([x, y, yaw]), self._trajectory.pose[row])
+        if np.hypot(*off[:2]) > MAX_DEVIATION_M:
             raise ValueError(
-                f"the robot is {np.hypot(*off[:2]):.2f} m off its way, expected {LOST} m at most"
+                f"the robot is {np.hypot(*off[:2]):.2f} m off its way, expected {MAX_DEVIATION_M} m at most"
             )
-        return velocity + np.clip(CORRECTS * off, -CORRECTS_AT_MOST, CORRECTS_AT_MOST)
+        return velocity + np.clip(CORRECTION_GAINS * off, -MAX_CORRECTION, MAX_CORRECTION)
 
 
-def _within(frame: Array, pose: Array) -> Array:
-    """`pose` as seen from the pose `frame`, (3,) each."""
+def _relative_pose(frame: Array, pose: Array) -> Array:
+    """Return `pose` (3,) relative to the pose `frame` (3,)."""
     c, s = np.cos(frame[2]), np.sin(frame[2])
     x, y = pose[:2] - frame[:2]
     turn = (pose[2] - frame[2] + np.pi) % (2.0 * np.pi) - np.pi

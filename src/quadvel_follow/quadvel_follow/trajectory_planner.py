@@ -1,4 +1,4 @@
-"""The node `trajectory_planner`: a way from a file to cmd_vel, in open loop or closed on odom. `trajectory` holds the ways."""
+"""ROS node `trajectory_planner`: velocities cmd_vel from a file, in open loop or closed on odom."""
 
 from __future__ import annotations
 
@@ -16,20 +16,22 @@ from quadvel_nodes.messages import MessageError, Refusals
 from quadvel_nodes.node import read_parameters, request_exit, run
 
 from .planar import planar_pose
-from .trajectory import SHIPPED, STEP, Trajectory, TrajectoryFollower, load
+from .trajectory import SHIPPED_FOLDER, STEP_S, Trajectory, TrajectoryFollower, load_trajectory
 
-SILENT = 0.2  # s, without odometry, after which a robot that is led by it stops
+ODOM_TIMEOUT_S = 0.2
+"""Silence of the odometry after which a closed-loop trajectory ends."""
 
 
 @attrs.frozen
 class TrajectoryParameters:
-    """The node's parameters."""
+    """Parameters of the node `trajectory_planner`."""
 
     file: str = attrs.field(
         default="zju", metadata={"description": "CSV or GPX file, or a shipped one: zju, eight"}
     )
     closed_loop: bool = attrs.field(
-        default=False, metadata={"description": "whether what the robot is off, by odom, is corrected"}
+        default=False,
+        metadata={"description": "whether deviations of odom from the trajectory are corrected"},
     )
     speed: float = attrs.field(
         default=0.5,
@@ -38,13 +40,17 @@ class TrajectoryParameters:
     )
 
     def load(self) -> Trajectory:
-        """Raises ValueError for a file that is none."""
-        shipped = SHIPPED / f"{self.file}.csv"
-        return load(shipped if shipped.is_file() else Path(self.file), self.speed)
+        """Load the trajectory.
+
+        Returns:
+            The trajectory. ValueError propagates for a wrong file.
+        """
+        shipped = SHIPPED_FOLDER / f"{self.file}.csv"
+        return load_trajectory(shipped if shipped.is_file() else Path(self.file), self.speed)
 
 
 class TrajectoryPlanner(Node):
-    """Starts at once, in closed loop with the first odometry; ends with 0 when the way is walked."""
+    """ROS node that executes a trajectory; in closed loop it starts with the first odometry."""
 
     def __init__(self) -> None:
         super().__init__("trajectory_planner")
@@ -54,12 +60,12 @@ class TrajectoryPlanner(Node):
         self._follower = TrajectoryFollower(self._trajectory, settings.closed_loop)
         self._closed = settings.closed_loop
         self._pose: np.ndarray | None = None
-        self._heard = -np.inf  # s, when odometry came last
-        self._began: float | None = None
+        self._odom_received_at = -np.inf  # s, when odometry came last
+        self._started_at: float | None = None
         self._refusals = Refusals()
         self._velocity = self.create_publisher(Twist, "cmd_vel", 10)
         self.create_subscription(Odometry, "odom", self._on_odom, qos_profile_sensor_data)
-        self.create_timer(STEP, self._step)
+        self.create_timer(STEP_S, self._step)
 
     def _now(self) -> float:
         return float(1e-9 * self.get_clock().now().nanoseconds)
@@ -67,21 +73,21 @@ class TrajectoryPlanner(Node):
     def _on_odom(self, message: Any) -> None:
         pose = np.array(planar_pose(message.pose.pose))
         if np.isfinite(pose).all():
-            self._pose, self._heard = pose, self._now()
+            self._pose, self._odom_received_at = pose, self._now()
         else:
             self._refusals.add("odom", MessageError(f"pose is {pose.tolist()}, expected finite numbers"))
 
     def _step(self) -> None:
         now = self._now()
-        if self._closed and now - self._heard > SILENT:
-            if self._began is not None:
-                request_exit(self, f"trajectory_planner: odom is silent for more than {SILENT} s")
+        if self._closed and now - self._odom_received_at > ODOM_TIMEOUT_S:
+            if self._started_at is not None:
+                request_exit(self, f"trajectory_planner: odom is silent for more than {ODOM_TIMEOUT_S} s")
             return
-        if self._began is None:
-            self._began = now
-            self.get_logger().info("sets off")
+        if self._started_at is None:
+            self._started_at = now
+            self.get_logger().info("starts")
         try:
-            velocity = self._follower.step(now - self._began, self._pose)
+            velocity = self._follower.step(now - self._started_at, self._pose)
         except ValueError as error:
             request_exit(self, f"trajectory_planner: {error}")
             return
@@ -94,5 +100,9 @@ class TrajectoryPlanner(Node):
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the node."""
+    """Run the node `trajectory_planner`.
+
+    Args:
+        args: Command line arguments, those of ROS included; None: `sys.argv`.
+    """
     run(TrajectoryPlanner, args)

@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.command_range import held, within_range
+from quadvel_description.command_range import clip_to_command_range, split_target
 from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 
@@ -67,8 +67,8 @@ class JointCommandLimiter:
         """
         if command.mode == MODE_DAMPING:
             return
-        beyond = (command.q != held(command.q)).any()
-        command.q, torque = within_range(command.q, command.kp, state.q)
+        beyond = (command.q != clip_to_command_range(command.q)).any()
+        command.q, torque = split_target(command.q, command.kp, state.q)
         command.tau = command.tau + torque
         self._count("target_out_of_range", beyond)
         requested = command.torque(state.q, state.dq)
@@ -118,6 +118,6 @@ def _add_torque(command: JointCommand, change: Array) -> None:
     The target changes as far as stiffness and range allow; feed-forward torque gives the rest.
     """
     shift = np.divide(change, command.kp, out=np.zeros(12), where=command.kp > 0.0)
-    q = np.where(shift == 0.0, command.q, held(command.q + shift))
+    q = np.where(shift == 0.0, command.q, clip_to_command_range(command.q + shift))
     command.tau = command.tau + change - command.kp * (q - command.q)
     command.q = q

@@ -41,9 +41,11 @@ class PolicyFile:
         except MetadataError as error:
             raise NetworkFileError(f"{path}: {error}") from None
         if self.metadata.rate_hz != RATE_HZ:
-            raise network.refuse("metadata field rate_hz", self.metadata.rate_hz, RATE_HZ)
+            raise network.mismatch_error("metadata field rate_hz", self.metadata.rate_hz, RATE_HZ)
         if network.input_size != self.metadata.observation.size:
-            raise network.refuse("length of input obs", network.input_size, self.metadata.observation.size)
+            raise network.mismatch_error(
+                "length of input obs", network.input_size, self.metadata.observation.size
+            )
         self._network = network
 
     def reset(self) -> None:

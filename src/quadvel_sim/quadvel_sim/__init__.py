@@ -1,4 +1,4 @@
-"""The stand-in robot: MuJoCo behind the drives of the real one, and the node that speaks for it."""
+"""Simulated AlienGo: MuJoCo physics, actuator model, world, laser, and ROS nodes."""
 
 from quadvel_sim.simulator import SensorNoise, Simulator, SimulatorConfig, Truth
 from quadvel_sim.terrain import Terrain

@@ -1,4 +1,7 @@
-"""A network that loses, delays, doubles, reorders and corrupts packets, by chance and from a seed. No sockets, no clock."""
+"""Unreliable network: seeded loss, delay, duplication, reordering and corruption of packets.
+
+No sockets and no clock: the caller passes the time.
+"""
 
 from __future__ import annotations
 
@@ -10,64 +13,99 @@ import attrs
 import numpy as np
 from attrs.validators import ge, le
 
-HELD_BACK = 0.005  # s that a reordered packet waits while others pass it
+REORDERING_DELAY_S = 0.005
+"""Additional delay of a reordered packet, s: later packets overtake it."""
 
 
-def _setting(description: str, most: float = 1.0) -> Any:
-    return attrs.field(default=0.0, validator=[ge(0.0), le(most)], metadata={"description": description})
+def _setting(description: str, upper: float = 1.0) -> Any:
+    """Return an attrs field: a number from 0 to `upper`, 0 by default."""
+    return attrs.field(default=0.0, validator=[ge(0.0), le(upper)], metadata={"description": description})
 
 
-@attrs.frozen(kw_only=True, slots=False)  # to stand beside another base
+@attrs.frozen(kw_only=True, slots=False)  # no slots: a subclass may have a second base class
 class NetworkConfig:
-    """What happens to packets, each way. Raises ValueError where a number can't be."""
+    """Faults of the network, the same in both directions.
 
-    network_delay: float = _setting("s that every packet takes")
-    network_jitter: float = _setting("s that a packet takes longer at most, evenly spread")
-    network_loss: float = _setting("share of packets, 0 to 1, that are lost")
-    network_duplicates: float = _setting("share of packets that come twice")
+    Raises:
+        ValueError: A number is out of its range.
+
+    Attributes:
+        network_delay: Constant delay of every packet, s.
+        network_jitter: Upper bound of the additional, uniformly distributed delay, s.
+        network_loss: Share of lost packets, 0 to 1.
+        network_duplicates: Share of duplicated packets, 0 to 1.
+        network_reordering: Share of packets that arrive `REORDERING_DELAY_S` late, 0 to 1.
+        network_corruption: Share of packets with one to eight flipped bits, 0 to 1.
+        network_seed: Seed of all random draws.
+    """
+
+    network_delay: float = _setting("constant delay of every packet, s")
+    network_jitter: float = _setting("largest additional delay of a packet, s, uniformly distributed")
+    network_loss: float = _setting("share of lost packets, 0 to 1")
+    network_duplicates: float = _setting("share of duplicated packets, 0 to 1")
     network_reordering: float = _setting(
-        f"share of packets that come {1e3 * HELD_BACK:g} ms late, behind others"
+        f"share of packets that arrive {1e3 * REORDERING_DELAY_S:g} ms late, after later ones"
     )
-    network_corruption: float = _setting("share of packets of which one to eight bits come flipped")
-    network_seed: int = attrs.field(default=0, metadata={"description": "seed of all that"})
+    network_corruption: float = _setting("share of packets with one to eight flipped bits")
+    network_seed: int = attrs.field(default=0, metadata={"description": "seed of the network's faults"})
 
 
 class BadNetwork:
-    """One way of it. Times are s on any clock."""
+    """One direction of an unreliable network. Times are in s on any clock."""
 
-    def __init__(self, config: NetworkConfig, way: int) -> None:
-        """way: 0 or 1, so that there and back are different accidents."""
+    def __init__(self, config: NetworkConfig, direction: int) -> None:
+        """Create an empty network.
+
+        Args:
+            config: Faults and their seed.
+            direction: 0 or 1; the two directions draw independent faults.
+        """
         self._config = config
-        self._rng = np.random.default_rng([config.network_seed, way])
-        self._under_way: list[tuple[float, int, bytes]] = []
+        self._rng = np.random.default_rng([config.network_seed, direction])
+        self._in_flight: list[tuple[float, int, bytes]] = []
         self._numbers = itertools.count()
 
     @property
-    def next(self) -> float:
-        """When the next packet arrives; inf where none is under way."""
-        return self._under_way[0][0] if self._under_way else float("inf")
+    def next_arrival(self) -> float:
+        """Arrival time of the next packet, s; inf if no packet is in flight."""
+        return self._in_flight[0][0] if self._in_flight else float("inf")
 
     def send(self, packet: bytes, now: float) -> None:
-        """Put a packet on its way."""
-        config = self._config
-        lost, twice, held, flipped, *late = self._rng.random(6)
-        if lost < config.network_loss:
-            return
-        if flipped < config.network_corruption:
-            packet = self._corrupted(packet)
-        delay = config.network_delay + (HELD_BACK if held < config.network_reordering else 0.0)
-        for chance in late[: 2 if twice < config.network_duplicates else 1]:
-            arrival = now + delay + config.network_jitter * chance
-            heapq.heappush(self._under_way, (arrival, next(self._numbers), packet))
+        """Send a packet; it may get lost, corrupted, delayed or duplicated.
 
-    def arrived(self, now: float) -> list[bytes]:
-        """The packets that have arrived by now, in their order."""
+        Args:
+            packet: Bytes of the packet.
+            now: Present time, s.
+        """
+        config = self._config
+        # Always six uniform draws a packet, so that one kind of fault does not change the others:
+        # arrival = now + delay + reordering + jitter * U(0, 1), with one jitter for each copy.
+        loss, duplicate, reorder, corrupt, *jitters = self._rng.random(6)
+        if loss < config.network_loss:
+            return
+        if corrupt < config.network_corruption:
+            packet = self._with_flipped_bits(packet)
+        delay = config.network_delay + (REORDERING_DELAY_S if reorder < config.network_reordering else 0.0)
+        for jitter in jitters[: 2 if duplicate < config.network_duplicates else 1]:
+            arrival = now + delay + config.network_jitter * jitter
+            heapq.heappush(self._in_flight, (arrival, next(self._numbers), packet))
+
+    def pop_arrived(self, now: float) -> list[bytes]:
+        """Remove and return the packets that have arrived.
+
+        Args:
+            now: Present time, s.
+
+        Returns:
+            Packets in order of arrival.
+        """
         packets = []
-        while self.next <= now:
-            packets.append(heapq.heappop(self._under_way)[2])
+        while self.next_arrival <= now:
+            packets.append(heapq.heappop(self._in_flight)[2])
         return packets
 
-    def _corrupted(self, packet: bytes) -> bytes:
+    def _with_flipped_bits(self, packet: bytes) -> bytes:
+        """Return the packet with one to eight random bits flipped."""
         changed = bytearray(packet)
         for bit in self._rng.choice(8 * len(packet), size=self._rng.integers(1, 9), replace=False).tolist():
             changed[bit // 8] ^= 1 << bit % 8

@@ -1,7 +1,8 @@
-"""The node `board`: the simulated robot behind the AlienGo's own UDP interface, for the real driver.
+"""ROS node `board`: the simulated robot behind the AlienGo's UDP interface.
 
-States and commands go over UDP alone. ROS sees the ground truth, the services of the simulation, and `~/remote`, with which
-a joystick takes the place of the wireless remote: axes lx, ly, rx, ry, and the buttons in the order of their bits there.
+States and commands use UDP only. The ROS side offers the ground truth, the services of the
+simulation, and the topic `~/remote`. A joystick on that topic replaces the wireless remote: axes
+lx, ly, rx, ry, and the buttons in the order of their bits in the protocol.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from threading import Thread
 from typing import Any
 
 from sensor_msgs.msg import Joy
+from typing_extensions import override
 
 from quadvel_description.state import RobotState
 from quadvel_driver.wire import Button, Remote
@@ -19,22 +21,23 @@ from quadvel_sim.loop import LoopReport
 from quadvel_sim.parameters import BoardParameters
 from quadvel_sim.simulation_node import SimulationNode
 
-STICKS = ("lx", "ly", "rx", "ry")
+STICK_AXES = ("lx", "ly", "rx", "ry")
 
 
 class BoardNode(SimulationNode[BoardParameters]):
-    """A simulated robot behind a UDP port."""
+    """ROS node of a simulated robot behind a UDP port."""
 
     def __init__(self) -> None:
+        """Start the board and the simulation."""
         super().__init__("board", BoardParameters)
         settings = self._settings
-        self._board = Board((settings.address, settings.port), settings, settings.off())
+        self._board = Board((settings.address, settings.port), settings, settings.calibration())
         self._board.loop = self._loop
         self._refused_before = 0
         self._network = Thread(target=self._board.run, name="network")
         self.create_subscription(Joy, "~/remote", self._on_remote, 10)
         self._network.start()
-        self.begin()
+        self.start()
 
     def destroy_node(self) -> None:
         """Stop the network, the simulation, then the node."""
@@ -42,26 +45,31 @@ class BoardNode(SimulationNode[BoardParameters]):
         self._network.join()
         super().destroy_node()
 
+    @override
     def publish_sample(self, state: RobotState, instant: float, view: bool) -> None:
-        """The state to the client."""
         self._board.publish(state, instant)
 
-    def figures(self) -> dict[str, object]:
-        """What came over the network."""
+    @override
+    def diagnostic_values(self) -> dict[str, object]:
         return {**self._board.counts, "last_refusal": self._board.last_refusal}
 
-    def worry(self, report: LoopReport) -> str:
-        """Whether datagrams could not be used."""
+    @override
+    def warning_text(self, report: LoopReport) -> str:
         refused = sum(count for name, count in self._board.counts.items() if name != "commands")
         new, self._refused_before = refused - self._refused_before, refused
         return f"{new} datagrams dropped in the last second: {self._board.last_refusal}" if new else ""
 
     def _on_remote(self, message: Any) -> None:
+        """Take axes and buttons of a joystick as state of the wireless remote."""
         axes, buttons = [*message.axes, 0.0, 0.0, 0.0, 0.0], message.buttons[: len(Button)]
-        held = sum(bit for bit, down in zip(Button, buttons, strict=False) if down)
-        self._board.remote = Remote(Button(held), **dict(zip(STICKS, axes, strict=False)))
+        pressed = sum(bit for bit, is_down in zip(Button, buttons, strict=False) if is_down)
+        self._board.remote = Remote(Button(pressed), **dict(zip(STICK_AXES, axes, strict=False)))
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the node."""
+    """Run the node `board`.
+
+    Args:
+        args: Command line arguments, those of ROS included; None: `sys.argv`.
+    """
     run(BoardNode, args)

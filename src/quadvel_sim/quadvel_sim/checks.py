@@ -1,4 +1,7 @@
-"""Field arguments for the attrs records of this package: conversion, bounds, the sentence that refuses."""
+"""Converters and validators for attrs fields; errors name field, value and expectation.
+
+Each function returns keyword arguments for `attrs.field`. Validators raise ValueError.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,15 @@ Array = NDArray[np.float64]
 
 
 def numbers(count: int, low: float = -np.inf) -> dict[str, Any]:
-    """Field arguments: one number or `count`, finite, at least `low`; kept as a read-only array (count,)."""
+    """Return field arguments for `count` finite numbers, stored as a read-only array (count,).
+
+    Args:
+        count: Length of the array; a single number is repeated.
+        low: Lower bound of every number.
+
+    Returns:
+        Converter and validator.
+    """
 
     def convert(value: Any) -> Any:
         try:
@@ -39,7 +50,15 @@ def numbers(count: int, low: float = -np.inf) -> dict[str, Any]:
 
 
 def number(low: float, high: float = np.inf) -> dict[str, Any]:
-    """Field arguments: a finite number from `low` to `high`."""
+    """Return field arguments for one finite number.
+
+    Args:
+        low: Lower bound.
+        high: Upper bound.
+
+    Returns:
+        Converter and validator.
+    """
 
     def convert(value: Any) -> Any:
         try:
@@ -56,7 +75,14 @@ def number(low: float, high: float = np.inf) -> dict[str, Any]:
 
 
 def whole_number(low: int = 0) -> dict[str, Any]:
-    """Field arguments: a whole number of `low` or more, such as a seed."""
+    """Return field arguments for an integer, such as a seed or a count.
+
+    Args:
+        low: Lower bound.
+
+    Returns:
+        Validator.
+    """
 
     def check(instance: object, attribute: attrs.Attribute[Any], value: int) -> None:
         if not isinstance(value, int) or value < low:
@@ -67,15 +93,29 @@ def whole_number(low: int = 0) -> dict[str, Any]:
 
 
 def or_none(field: dict[str, Any]) -> dict[str, Any]:
-    """Field arguments: as `field`, or None."""
+    """Return field arguments for an optional value.
+
+    Args:
+        field: Converter and validator of the value.
+
+    Returns:
+        Converter and validator that also accept None.
+    """
     return {
         "converter": attrs.converters.optional(field["converter"]),
         "validator": attrs.validators.optional(field["validator"]),
     }
 
 
-def points(least: int) -> dict[str, Any]:
-    """Field arguments: at least so many points, x and y in m; kept as a read-only array (n, 2)."""
+def points(minimum: int) -> dict[str, Any]:
+    """Return field arguments for a list of points, stored as a read-only array (n, 2).
+
+    Args:
+        minimum: Smallest number of points.
+
+    Returns:
+        Converter and validator; coordinates are finite, and no point is repeated directly.
+    """
 
     def convert(value: Any) -> Array:
         try:
@@ -86,12 +126,12 @@ def points(least: int) -> dict[str, Any]:
         return values
 
     def check(instance: object, attribute: attrs.Attribute[Any], value: Array) -> None:
-        if value.ndim != 2 or value.shape[1:] != (2,) or len(value) < least or not np.isfinite(value).all():
+        if value.ndim != 2 or value.shape[1:] != (2,) or len(value) < minimum or not np.isfinite(value).all():
             found = f"shape {value.shape}" if value.ndim else "no list of pairs of numbers"
             raise ValueError(
-                f"{type(instance).__name__}.{attribute.name}: found {found}, expected {least} or more points [x, y]"
+                f"{type(instance).__name__}.{attribute.name}: found {found}, expected {minimum} or more points [x, y]"
             )
-        if least > 1 and not np.hypot(*np.diff(value, axis=0).T).all():
+        if minimum > 1 and not np.hypot(*np.diff(value, axis=0).T).all():
             raise ValueError(
                 f"{type(instance).__name__}.{attribute.name}: found a point twice in a row, expected it once"
             )
@@ -100,7 +140,14 @@ def points(least: int) -> dict[str, Any]:
 
 
 def one_of(choices: Sequence[str]) -> dict[str, Any]:
-    """Field arguments: one of these words."""
+    """Return field arguments for one of several strings.
+
+    Args:
+        choices: Allowed values.
+
+    Returns:
+        Validator.
+    """
 
     def check(instance: object, attribute: attrs.Attribute[Any], value: object) -> None:
         if value not in choices:
@@ -112,7 +159,11 @@ def one_of(choices: Sequence[str]) -> dict[str, Any]:
 
 
 def truth_value() -> dict[str, Any]:
-    """Field arguments: true or false."""
+    """Return field arguments for a boolean.
+
+    Returns:
+        Validator.
+    """
 
     def check(instance: object, attribute: attrs.Attribute[Any], value: object) -> None:
         if not isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""The parameters of the nodes `sim_node` and `board`, and the simulation that they ask for. Knows no ROS."""
+"""Parameters of the nodes `sim_node` and `board`. No ROS."""
 
 from __future__ import annotations
 
@@ -6,27 +6,35 @@ from typing import Any
 
 import attrs
 import numpy as np
+from typing_extensions import override
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_driver.calibration import Calibration
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.config import SensorNoise, SimulatorConfig
-from quadvel_sim.loop import MODES, Publish, SayWaiting, SimulationLoop
+from quadvel_sim.loop import MODES, PublishState, ReportWaiting, SimulationLoop
 from quadvel_sim.simulator import Simulator
 from quadvel_sim.terrain import KINDS, Terrain
-from quadvel_sim.world import SHIPPED, World
+from quadvel_sim.world import SHIPPED_WORLDS, World
 
 _NOISE, _TERRAIN, _CONFIG = SensorNoise(), Terrain(), SimulatorConfig()
 
 
 def _parameter(default: Any, description: str) -> Any:
+    """Return an attrs field of a node parameter."""
     return attrs.field(default=default, metadata={"description": description})
 
 
-@attrs.frozen(kw_only=True, slots=False)  # to stand beside another base
+@attrs.frozen(kw_only=True, slots=False)  # no slots: a subclass has a second base class
 class PlantParameters(Scheduling):
-    """The simulated robot and its ground; what each record of the simulation may hold is that record's own matter."""
+    """Parameters of the simulated robot and its ground.
+
+    Other bounds are checked by the records that these values fill.
+
+    Raises:
+        ValueError: `state_rate` is no divisor of 1000 Hz or below 50 Hz.
+    """
 
     keyframe: str = _parameter("lie", "posture at the start: lie or stand")
     state_rate: int = _parameter(200, "rate of the states, Hz: a divisor of 1000, 50 at least")
@@ -34,7 +42,7 @@ class PlantParameters(Scheduling):
     seed: int = _parameter(_CONFIG.seed, "seed of sensor and torque noise")
     actuator_file: str = _parameter("", "actuator model, YAML; empty: the shipped AlienGo")
     world: str = _parameter(
-        "", f"what is around the robot: a YAML file, or {', '.join(SHIPPED)}; empty: nothing"
+        "", f"world around the robot: a YAML file, or {', '.join(SHIPPED_WORLDS)}; empty: none"
     )
     terrain: str = _parameter(_TERRAIN.kind, f"the ground: {', '.join(KINDS)}")
     slope: float = _parameter(_TERRAIN.slope, "inclination of the ground, rad, rising along x")
@@ -44,11 +52,11 @@ class PlantParameters(Scheduling):
     friction: tuple[float, ...] = _parameter(
         tuple(_CONFIG.friction.tolist()), "sliding friction of the feet: one number, or FR, FL, RR, RL"
     )
-    payload: float = _parameter(_CONFIG.payload, "mass on the trunk, kg; below zero it is taken off")
+    payload: float = _parameter(_CONFIG.payload, "mass on the trunk, kg; negative: a lighter trunk")
     payload_position: tuple[float, ...] = _parameter(
         tuple(_CONFIG.payload_position.tolist()), "centre of that mass in the trunk frame, m"
     )
-    hung: bool = _parameter(_CONFIG.hung, "whether the trunk is held in the air, as on a stand")
+    hung: bool = _parameter(_CONFIG.suspended, "whether the trunk is held in the air, as on a stand")
     watchdog: float = _parameter(_CONFIG.watchdog, "s without a command after which the drives brake")
     watchdog_kd: float = _parameter(_CONFIG.watchdog_kd, "gain of that brake, N m s/rad")
     noise_q: float = _parameter(_NOISE.q, "standard deviation of q, rad")
@@ -63,18 +71,36 @@ class PlantParameters(Scheduling):
 
     @property
     def period(self) -> int:
-        """Simulated ms from state to state."""
+        """Simulated time between two states, ms."""
         return 1000 // self.state_rate
 
-    def loop(self, simulator: Simulator, publish: Publish, say_waiting: SayWaiting) -> SimulationLoop:
-        """The loop that runs this robot: in real time, and it waits for nobody; nor has a board words for a pause."""
+    def make_loop(
+        self, simulator: Simulator, publish: PublishState, report_waiting: ReportWaiting
+    ) -> SimulationLoop:
+        """Create the loop that runs this robot: in real time, without waiting for a controller.
+
+        Args:
+            simulator: The simulated robot.
+            publish: Receives states, see `SimulationLoop`.
+            report_waiting: Unused here: the UDP protocol of a board has no message for a pause.
+
+        Returns:
+            The loop, not yet running.
+        """
         return SimulationLoop(simulator, publish, period=self.period, answer_timeout=0.0)
 
     def config(self) -> SimulatorConfig:
-        """The simulation asked for. ValueError names what it cannot be."""
+        """Create the configuration of the simulator.
+
+        Returns:
+            Configuration with terrain, world, noise and actuator model.
+
+        Raises:
+            ValueError: A parameter is out of its range, or a file cannot be read.
+        """
         return SimulatorConfig(
             actuator=self._actuator(),
-            terrain=self.ground(self.terrain, self.slope),
+            terrain=self.make_terrain(self.terrain, self.slope),
             world=World.load(self.world) if self.world else None,
             noise=SensorNoise(
                 self.noise_q,
@@ -87,13 +113,24 @@ class PlantParameters(Scheduling):
             friction=np.array(self.friction),
             payload=self.payload,
             payload_position=np.array(self.payload_position),
-            hung=self.hung,
+            suspended=self.hung,
             watchdog=self.watchdog,
             watchdog_kd=self.watchdog_kd,
         )
 
-    def ground(self, kind: str, slope: float) -> Terrain:
-        """Ground of a kind, inclined by `slope` (rad), with the roughness asked for. ValueError names what it cannot be."""
+    def make_terrain(self, kind: str, slope: float) -> Terrain:
+        """Create a terrain with the roughness of the parameters.
+
+        Args:
+            kind: `flat`, `slope` or `rough`.
+            slope: Inclination, rad.
+
+        Returns:
+            The terrain.
+
+        Raises:
+            ValueError: The kind is unknown, or a number is out of its range.
+        """
         return Terrain(kind, slope, self.roughness, self.wavelength, seed=self.terrain_seed)
 
     def _actuator(self) -> ActuatorParameters:
@@ -107,11 +144,15 @@ class PlantParameters(Scheduling):
 
 @attrs.frozen(kw_only=True)
 class SimParameters(PlantParameters):
-    """Those of `sim_node`: time may wait for commands."""
+    """Parameters of the node `sim_node`: the simulation may wait for commands.
+
+    Raises:
+        ValueError: A mode or a timeout is out of its range.
+    """
 
     mode: str = _parameter("realtime", f"how time passes: {', '.join(MODES)}; lockstep waits for each LowCmd")
     answer_timeout: float = _parameter(
-        1.0, "s that simulated time stands still for an answer; lockstep then sends the state again"
+        1.0, "s that simulated time waits for an answer; lockstep then sends the state again"
     )
 
     def __attrs_post_init__(self) -> None:
@@ -121,23 +162,32 @@ class SimParameters(PlantParameters):
         if not 0.0 < self.answer_timeout < 3600.0:
             raise ValueError(f"answer_timeout is {self.answer_timeout} s, expected a time above 0")
 
-    def loop(self, simulator: Simulator, publish: Publish, say_waiting: SayWaiting) -> SimulationLoop:
-        """The loop that runs this robot, in the mode that was asked for."""
+    @override
+    def make_loop(
+        self, simulator: Simulator, publish: PublishState, report_waiting: ReportWaiting
+    ) -> SimulationLoop:
         return SimulationLoop(
-            simulator, publish, self.mode, self.period, self.answer_timeout, say_waiting=say_waiting
+            simulator, publish, self.mode, self.period, self.answer_timeout, report_waiting=report_waiting
         )
 
 
 @attrs.frozen(kw_only=True)
 class BoardParameters(PlantParameters, NetworkConfig):
-    """Those of `board`: where it listens, and how bad the network is."""
+    """Parameters of the node `board`: address and network faults."""
 
     state_rate: int = _parameter(1000, "rate of the states, Hz: a divisor of 1000, 50 at least")
     address: str = _parameter("127.0.0.1", "IP address on which the board listens")
     port: int = _parameter(8007, "UDP port on which the board listens; 0: any that is free")
-    joint_zeros: tuple[float, ...] = _parameter(12 * (0.0,), "what encoders show at zero, rad")
-    imu_mounting: tuple[float, ...] = _parameter((0.0, 0.0), "how the IMU leans: about x and about y, rad")
+    joint_zeros: tuple[float, ...] = _parameter(12 * (0.0,), "reading of the encoders at zero, rad")
+    imu_mounting: tuple[float, ...] = _parameter((0.0, 0.0), "tilt of the IMU about x and y, rad")
 
-    def off(self) -> Calibration:
-        """What is off with this robot's sensors. CalibrationError names what it cannot be."""
+    def calibration(self) -> Calibration:
+        """Create the calibration errors of the simulated sensors.
+
+        Returns:
+            Joint zeros and IMU mounting.
+
+        Raises:
+            CalibrationError: A value is out of its range.
+        """
         return Calibration(np.array(self.joint_zeros), np.array(self.imu_mounting))

@@ -1,6 +1,7 @@
-"""Persons who walk through a world: mocap bodies of a MuJoCo model, moved by `Walker`. How legs swing is `walker`'s matter.
+"""Walking people in a world: mocap bodies of a MuJoCo model that are moved by `Walker`.
 
-Each walks its way whatever happens around it, with one exception: with the robot close ahead it stands until the robot is gone.
+Each person follows its path and ignores its surroundings, with one exception: a person waits while
+the robot is close ahead of it. `walker` models the gait.
 """
 
 from __future__ import annotations
@@ -12,151 +13,186 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_sim.laser import SEEN
+from quadvel_sim.laser import LASER_VISIBLE_GROUP
 from quadvel_sim.walker import Walker
 from quadvel_sim.world import Person, World
 
 Array = NDArray[np.float64]
 
-PERIOD = 10  # ms, from one position of a person to the next
-CLEAR = 0.5  # m, from a person to the robot's middle line ahead of it, below which it waits
-FAR = 40.0  # m, from the robot, beyond which a person walks on in leaps of `LEAP`
-LEAP = 0.5  # s
-_HALF_ROBOT = 0.4  # m, of that line before and behind the trunk's origin
-_HIPS, _SHOULDERS, _HEAD = 0.85, 1.45, 1.65  # m above the ground
-_GIRTH, _SKULL = 0.14, 0.11  # m, radii
-_CLOTHES = {True: (0.15, 0.65, 0.25, 1.0), False: (0.3, 0.4, 0.65, 1.0)}  # of who is led, of others
-_SKIN = (0.85, 0.7, 0.6, 1.0)
+UPDATE_PERIOD_MS = 10
+"""Simulated time between two positions of a person."""
+WAIT_DISTANCE_M = 0.5
+"""Distance to the robot's centre line, ahead of a person, below which the person waits."""
+COARSE_DISTANCE_M = 40.0
+"""Distance from the robot beyond which a person is updated every `COARSE_PERIOD_S` only."""
+COARSE_PERIOD_S = 0.5
+_HALF_ROBOT_LENGTH_M = 0.4  # of the centre line, ahead of and behind the trunk's origin
+_HIP_HEIGHT_M, _SHOULDER_HEIGHT_M, _HEAD_HEIGHT_M = 0.85, 1.45, 1.65  # m above the ground
+_TORSO_RADIUS_M, _HEAD_RADIUS_M = 0.14, 0.11  # m, radii
+_CLOTHES_RGBA = {True: (0.15, 0.65, 0.25, 1.0), False: (0.3, 0.4, 0.65, 1.0)}  # of who is led, of others
+_SKIN_RGBA = (0.85, 0.7, 0.6, 1.0)
 _PARTS = ("body", "left", "right")
 
 
-def name_of(index: int) -> str:
-    """The person's name in a model."""
+def person_name(index: int) -> str:
+    """Return the name of a person in a model.
+
+    Args:
+        index: Index of the person in the world.
+
+    Returns:
+        Prefix of the person's body names.
+    """
     return f"person_{index}"
 
 
-def add_to(spec: mujoco.MjSpec, persons: Sequence[Person]) -> None:
-    """Three mocap bodies for each: two legs, each a cylinder, and what is above them."""
+def add_persons(spec: mujoco.MjSpec, persons: Sequence[Person]) -> None:
+    """Add three mocap bodies per person: two legs (cylinders), and trunk with head.
+
+    Args:
+        spec: Model that is extended.
+        persons: People of the world.
+    """
     capsule, cylinder = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER
     for i, person in enumerate(persons):
-        parts = {part: spec.worldbody.add_body(name=f"{name_of(i)}_{part}", mocap=True) for part in _PARTS}
-        common = {"contype": 1, "conaffinity": 0, "group": SEEN}
+        parts = {
+            part: spec.worldbody.add_body(name=f"{person_name(i)}_{part}", mocap=True) for part in _PARTS
+        }
+        common = {"contype": 1, "conaffinity": 0, "group": LASER_VISIBLE_GROUP}
         for part in _PARTS[1:]:
-            size, middle = [person.radius, 0.5 * _HIPS, 0.0], [0.0, 0.0, 0.5 * _HIPS]
-            name = f"{name_of(i)}_{part}"
+            size, middle = [person.radius, 0.5 * _HIP_HEIGHT_M, 0.0], [0.0, 0.0, 0.5 * _HIP_HEIGHT_M]
+            name = f"{person_name(i)}_{part}"
             parts[part].add_geom(
                 name=name, type=cylinder, size=size, pos=middle, rgba=(0.2, 0.2, 0.25, 1.0), **common
             )
-        trunk = [0.0, 0.0, _HIPS, 0.0, 0.0, _SHOULDERS]
-        clothes = _CLOTHES[person.led]
+        trunk = [0.0, 0.0, _HIP_HEIGHT_M, 0.0, 0.0, _SHOULDER_HEIGHT_M]
+        clothes = _CLOTHES_RGBA[person.led]
         parts["body"].add_geom(
-            name=f"{name_of(i)}_body",
+            name=f"{person_name(i)}_body",
             type=capsule,
-            size=[_GIRTH, 0.0, 0.0],
+            size=[_TORSO_RADIUS_M, 0.0, 0.0],
             fromto=trunk,
             rgba=clothes,
             **common,
         )
         parts["body"].add_geom(
-            name=f"{name_of(i)}_head",
+            name=f"{person_name(i)}_head",
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=[_SKULL, 0.0, 0.0],
-            pos=[0.0, 0.0, _HEAD],
-            rgba=_SKIN,
+            size=[_HEAD_RADIUS_M, 0.0, 0.0],
+            pos=[0.0, 0.0, _HEAD_HEIGHT_M],
+            rgba=_SKIN_RGBA,
             **common,
         )
 
 
 @attrs.define
 class _Actor:
-    """One person: how it walks, and what it does next on its way."""
+    """State of one person on its path."""
 
     person: Person
     walker: Walker
-    stands_until: float = 0.0  # s
-    stops_taken: int = 0
-    speeds_taken: int = 0
-    round: int = 0
-    late: float = 0.0  # s, by which it is behind the time
+    stands_until: float = 0.0  # s, end of the present stop
+    next_stop: int = 0
+    next_speed: int = 0
+    lap: int = 0
+    pending_time: float = 0.0  # s, by which it is behind the time
 
 
 class Persons:
-    """All persons of a world in a model. Equal robots' ways give equal persons' ways."""
+    """All people of a world in a model; equal motion of the robot gives equal motion of them."""
 
     def __init__(self, model: mujoco.MjModel, world: World) -> None:
+        """Find the mocap bodies of the people.
+
+        Args:
+            model: Model that `add_persons` has extended.
+            world: World with the people.
+        """
         self._world = world
         self._mocap = np.array(
             [
-                [model.body(f"{name_of(i)}_{part}").mocapid.item() for part in _PARTS]
+                [model.body(f"{person_name(i)}_{part}").mocapid.item() for part in _PARTS]
                 for i in range(len(world.persons))
             ],
             dtype=int,
         ).reshape(-1, len(_PARTS))
         self._actors: list[_Actor] = []
-        self._places = np.zeros((len(world.persons), len(_PARTS), 2))  # body and legs, m
+        self._positions = np.zeros((len(world.persons), len(_PARTS), 2))  # body and legs, m
         self._time = 0.0
 
     def reset(self, data: mujoco.MjData) -> None:
-        """Put everybody to where they begin."""
+        """Put everybody back to the start.
+
+        Args:
+            data: State of the model; the mocap positions are written.
+        """
         self._time = 0.0
-        self._actors = [_actor(person) for person in self._world.persons]
-        self._place(data, list(range(len(self._actors))))
+        self._actors = [_make_actor(person) for person in self._world.persons]
+        self._write_positions(data, list(range(len(self._actors))))
 
     def step(self, data: mujoco.MjData) -> None:
-        """Walk on for a `PERIOD`; `data` has the robot's position in the first 7 of qpos."""
-        dt = 1e-3 * PERIOD
+        """Advance everybody by `UPDATE_PERIOD_MS`.
+
+        Args:
+            data: State of the model; the robot's pose is in the first 7 values of qpos, the mocap
+                positions are written.
+        """
+        dt = 1e-3 * UPDATE_PERIOD_MS
         self._time += dt
         w, x, y, z = data.qpos[3:7]
         yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
         robot, ahead = data.qpos[:2], np.array([np.cos(yaw), np.sin(yaw)])
-        near = np.abs(self._places[:, 0] - robot).max(1) < FAR
+        near = np.abs(self._positions[:, 0] - robot).max(1) < COARSE_DISTANCE_M
         moved = []
         for i, actor in enumerate(self._actors):
-            actor.late += dt
-            if near[i] or actor.late >= LEAP:
-                actor.walker.waiting = self._stands(actor) or _blocked(actor.walker, robot, ahead)
-                actor.walker.step(actor.late)
-                actor.late = 0.0
+            actor.pending_time += dt
+            if near[i] or actor.pending_time >= COARSE_PERIOD_S:
+                actor.walker.waiting = self._is_at_stop(actor) or _is_robot_close_ahead(
+                    actor.walker, robot, ahead
+                )
+                actor.walker.step(actor.pending_time)
+                actor.pending_time = 0.0
                 moved.append(i)
-        self._place(data, moved)
+        self._write_positions(data, moved)
 
     @property
     def poses(self) -> Array:
-        """Where they are and where they walk to, (n, 3): x, y in m, yaw in rad; who is led first."""
-        return np.column_stack([self._places[:, 0], [actor.walker.heading for actor in self._actors]])
+        """Pose of each person, (n, 3): x, y in m, heading in rad; the followed person first."""
+        return np.column_stack([self._positions[:, 0], [actor.walker.heading for actor in self._actors]])
 
     @property
     def travelled(self) -> Array:
-        """How far along their ways they are, rounds included, (n,), m."""
+        """Distance that each person has walked along its path, laps included, (n,), m."""
         return np.array([actor.walker.travelled for actor in self._actors])
 
-    def _stands(self, actor: _Actor) -> bool:
-        """Whether it stands now at one of its stops; takes up the speeds that it has come to."""
+    def _is_at_stop(self, actor: _Actor) -> bool:
+        """Return whether the person stands at a stop now; update its lap, speed and next stop."""
         person, walker = actor.person, actor.walker
-        if walker.closed and walker.travelled >= (actor.round + 1) * walker.length:
-            actor.round, actor.stops_taken, actor.speeds_taken = actor.round + 1, 0, 0
-        along = walker.travelled - actor.round * walker.length
-        while actor.speeds_taken < len(person.speeds) and along >= person.speeds[actor.speeds_taken][0]:
-            walker.speed = person.speeds[actor.speeds_taken][1]
-            actor.speeds_taken += 1
-        if actor.stops_taken < len(person.stops) and along >= person.stops[actor.stops_taken][0]:
-            actor.stands_until = self._time + person.stops[actor.stops_taken][1]
-            actor.stops_taken += 1
+        if walker.closed and walker.travelled >= (actor.lap + 1) * walker.length:
+            actor.lap, actor.next_stop, actor.next_speed = actor.lap + 1, 0, 0
+        along = walker.travelled - actor.lap * walker.length
+        while actor.next_speed < len(person.speeds) and along >= person.speeds[actor.next_speed][0]:
+            walker.speed = person.speeds[actor.next_speed][1]
+            actor.next_speed += 1
+        if actor.next_stop < len(person.stops) and along >= person.stops[actor.next_stop][0]:
+            actor.stands_until = self._time + person.stops[actor.next_stop][1]
+            actor.next_stop += 1
         return self._time < actor.stands_until
 
-    def _place(self, data: mujoco.MjData, which: list[int]) -> None:
-        """Bring the bodies of these persons to where their walkers are."""
+    def _write_positions(self, data: mujoco.MjData, which: list[int]) -> None:
+        """Move the mocap bodies of these people to the positions of their walkers."""
         if not which:
             return
         for i in which:
             walker = self._actors[i].walker
-            self._places[i, 0], self._places[i, 1:] = walker.position, walker.legs[:, :2]
-        places, mocap = self._places[which], self._mocap[which]
+            self._positions[i, 0], self._positions[i, 1:] = walker.position, walker.legs[:, :2]
+        places, mocap = self._positions[which], self._mocap[which]
         data.mocap_pos[mocap, :2] = places
         data.mocap_pos[mocap, 2] = self._world.height(places[:, :1, 0], places[:, :1, 1])
 
 
-def _actor(person: Person) -> _Actor:
+def _make_actor(person: Person) -> _Actor:
+    """Return the state of a person at the start."""
     walker = Walker(
         person.path,
         speed=person.speed,
@@ -166,15 +202,18 @@ def _actor(person: Person) -> _Actor:
         travelled=person.begins_at,
         closed=person.closed,
     )
-    return _Actor(person, walker, stops_taken=sum(at < person.begins_at for at, _ in person.stops))
+    return _Actor(person, walker, next_stop=sum(at < person.begins_at for at, _ in person.stops))
 
 
-def _blocked(walker: Walker, robot: Array, ahead: Array) -> bool:
-    """Whether the robot, a line along `ahead` (2,) around `robot` (2,), is close before the person."""
+def _is_robot_close_ahead(walker: Walker, robot: Array, ahead: Array) -> bool:
+    """Return whether the robot is close in front of a person.
+
+    The robot is a line segment along `ahead` (2,) around `robot` (2,).
+    """
     to_robot = robot - walker.position
-    if abs(to_robot[0]) + abs(to_robot[1]) > 2.0 * (_HALF_ROBOT + CLEAR):
+    if abs(to_robot[0]) + abs(to_robot[1]) > 2.0 * (_HALF_ROBOT_LENGTH_M + WAIT_DISTANCE_M):
         return False
-    along = min(max(-float(to_robot @ ahead), -_HALF_ROBOT), _HALF_ROBOT)
+    along = min(max(-float(to_robot @ ahead), -_HALF_ROBOT_LENGTH_M), _HALF_ROBOT_LENGTH_M)
     nearest = to_robot + along * ahead
     towards = nearest @ [np.cos(walker.heading), np.sin(walker.heading)]
-    return bool(towards > 0.0 and np.hypot(*nearest) < CLEAR)
+    return bool(towards > 0.0 and np.hypot(*nearest) < WAIT_DISTANCE_M)

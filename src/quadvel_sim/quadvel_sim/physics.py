@@ -1,6 +1,7 @@
-"""How a simulator solves motion and contact: the plant that everything was made on, and a second one to judge on.
+"""Settings of integration and contacts: default plant and held-out plant for evaluation.
 
-A policy that is good on one plant alone has learned that plant's contacts. The second one differs in what no data sheet says.
+A policy that works on one plant only may have learned that plant's contacts. The held-out plant
+changes the properties that no data sheet states.
 """
 
 from __future__ import annotations
@@ -16,25 +17,33 @@ CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone
 
 @attrs.frozen
 class Physics:
-    """MuJoCo's settings beyond the robot's own description, which the defaults leave as they are."""
+    """MuJoCo settings that differ from the model of the robot; the defaults change nothing.
+
+    Attributes:
+        substeps: Physics steps per millisecond; torques are constant in between.
+        cone: Shape of the friction cone; a pyramid lets feet creep sideways.
+        contact_time: Time constant of contacts, s; a shorter one makes contacts stiffer.
+        contact_damping: Damping ratio of contacts.
+        torsional_friction: Torsional friction coefficient of the feet, m: a turning foot is braked
+            with this times its load; 0: none.
+        inertia: Factor of the inertia of every link.
+        mass: Factor of the mass of every link.
+    """
 
     substeps: int = attrs.field(default=1, **whole_number())
-    """Steps of the physics in a millisecond; torques are held in between."""
     cone: str = attrs.field(default="elliptic", validator=attrs.validators.in_(CONES))
-    """Shape of the friction cone; a pyramid lets feet creep sideways."""
     contact_time: float = attrs.field(default=0.01, **number(0.002, 0.1))
-    """Time constant of contacts, s: the shorter, the stiffer."""
     contact_damping: float = attrs.field(default=1.0, **number(0.1, 5.0))
-    """Damping ratio of contacts."""
     torsional_friction: float = attrs.field(default=0.0, **number(0.0, 0.1))
-    """Of the feet, m: turning on the spot costs this times the load. 0: none."""
     inertia: float = attrs.field(default=1.0, **number(0.5, 2.0))
-    """Of every link, as a share of what the model says."""
     mass: float = attrs.field(default=1.0, **number(0.5, 2.0))
-    """Of every link, the same."""
 
     def apply(self, model: mujoco.MjModel) -> None:
-        """Put these into a compiled model of the robot."""
+        """Apply the settings to a compiled model of the robot.
+
+        Args:
+            model: Model that is changed in place.
+        """
         if self == Physics():
             return
         model.opt.timestep /= self.substeps
@@ -50,7 +59,7 @@ class Physics:
         mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-SECOND = Physics(
+HELD_OUT_PHYSICS = Physics(
     substeps=2,
     cone="pyramidal",
     contact_time=0.005,
@@ -59,4 +68,4 @@ SECOND = Physics(
     inertia=1.15,
     mass=1.03,
 )
-"""The plant that policies are judged on beside the usual one."""
+"""Held-out plant: policies are evaluated on it in addition to the default plant."""

@@ -1,4 +1,4 @@
-"""The node `sim_node`: the simulated robot on the topics of the real one. How it runs is `loop`'s matter."""
+"""ROS node `sim_node`: the simulated robot behind the topics of the real one."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rosgraph_msgs.msg import Clock as ClockMessage
+from typing_extensions import override
 
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState, Waiting
@@ -20,9 +21,15 @@ from quadvel_sim.simulator import Simulator
 
 
 class SimNode(SimulationNode[SimParameters]):
-    """A simulated robot behind low_state and low_cmd."""
+    """ROS node of a simulated robot behind low_state and low_cmd."""
 
     def __init__(self, make_simulator: Callable[[SimulatorConfig], Simulator] = Simulator) -> None:
+        """Start the simulation.
+
+        Args:
+            make_simulator: Creates the simulator from its configuration; evaluation passes other
+                plants.
+        """
         super().__init__("sim_node", SimParameters, make_simulator)
         self._refusals = Refusals()
         self._refused_before = self._unanswered_before = 0
@@ -32,10 +39,10 @@ class SimNode(SimulationNode[SimParameters]):
         noise = self._loop.simulator.config.noise
         self._view = RobotView(self, noise.orientation, noise.angular_velocity, noise.linear_acceleration)
         self.create_subscription(LowCmd, "low_cmd", self._on_command, 10)
-        self.begin()
+        self.start()
 
+    @override
     def publish_sample(self, state: RobotState, instant: float, view: bool) -> None:
-        """The state as low_state, and for people."""
         stamp = self.stamp(instant)
         if self._settings.mode != REALTIME:
             self._clock_publisher.publish(ClockMessage(clock=stamp))
@@ -45,17 +52,17 @@ class SimNode(SimulationNode[SimParameters]):
         if view:
             self._view.publish(stamp, state)
 
-    def say_waiting(self, tick: int, instant: float) -> None:
-        """On the topic `waiting`."""
+    @override
+    def publish_waiting(self, tick: int, instant: float) -> None:
         if self.context.ok():
             self._waiting.publish(Waiting(stamp=self.stamp(instant), tick=tick))
 
-    def figures(self) -> dict[str, object]:
-        """The messages that were refused."""
+    @override
+    def diagnostic_values(self) -> dict[str, object]:
         return {**self._refusals.diagnostic_values()}
 
-    def worry(self, report: LoopReport) -> str:
-        """Whether messages were refused, or none came where one was waited for."""
+    @override
+    def warning_text(self, report: LoopReport) -> str:
         refused = self._refusals.total - self._refused_before
         unanswered = report.unanswered - self._unanswered_before
         self._refused_before, self._unanswered_before = self._refusals.total, report.unanswered
@@ -64,6 +71,7 @@ class SimNode(SimulationNode[SimParameters]):
         return "waiting for the LowCmd that answers the last state" if unanswered else ""
 
     def _on_command(self, message: Any) -> None:
+        """Pass a command to the simulation."""
         try:
             self._loop.submit(read_low_cmd(message))
         except ValueError as error:
@@ -71,5 +79,9 @@ class SimNode(SimulationNode[SimParameters]):
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the node."""
+    """Run the node `sim_node`.
+
+    Args:
+        args: Command line arguments, those of ROS included; None: `sys.argv`.
+    """
     run(SimNode, args)

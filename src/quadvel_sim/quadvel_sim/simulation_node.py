@@ -1,6 +1,6 @@
-"""What the nodes around a simulated robot have in common: its time, its truth, its services, how it does.
+"""Base class of the simulation's ROS nodes: time, ground truth, services and diagnostics.
 
-How the robot is driven and what it reports is the matter of those that stand on this: `sim_node` and `board_node`.
+The subclasses in `sim_node` and `board_node` define how the robot is commanded and how it reports.
 """
 
 from __future__ import annotations
@@ -37,19 +37,18 @@ from quadvel_sim.slowness import SlownessLog
 from quadvel_sim.terrain import Terrain
 from quadvel_sim.world_view import WorldView
 
-TRUTH_PERIOD = 5  # ms
-VIEW_PERIOD = 20  # ms, of what people look at
-GROUND_SIZE, GROUND_STEP = (
-    16.0,
-    0.16,
-)  # m, edge of the square of ground that they see, and distance of its points
-GROUND_COLOUR = (0.25, 0.29, 0.32, 1.0)
+TRUTH_PERIOD_MS = 5
+VIEW_PERIOD_MS = 20
+"""Period of the topics for display."""
+GROUND_SIZE_M, GROUND_SPACING_M = 16.0, 0.16
+"""Edge of the displayed square of ground, and distance of its points."""
+GROUND_RGBA = (0.25, 0.29, 0.32, 1.0)
 
 Settings = TypeVar("Settings", bound=PlantParameters)
 
 
 class SimulationNode(Node, ABC, Generic[Settings]):
-    """Services and ground truth around a SimulationLoop, which runs in a thread of its own once `begin` is called."""
+    """Services and ground truth around a SimulationLoop in a thread that `start` begins."""
 
     def __init__(
         self,
@@ -57,6 +56,13 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         parameters: type[Settings],
         make_simulator: Callable[[SimulatorConfig], Simulator] = Simulator,
     ) -> None:
+        """Read the parameters and create the simulation; `start` runs it.
+
+        Args:
+            name: Name of the node.
+            parameters: Class of the parameters.
+            make_simulator: Creates the simulator from its configuration.
+        """
         super().__init__(name)
         self._settings, self._make_simulator = read_parameters(self, parameters), make_simulator
         simulator = make_simulator(self._settings.config())
@@ -67,7 +73,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         self._slowness = SlownessLog()
         self._has_fallen = False
         self._failure = ""
-        self._loop = self._settings.loop(simulator, self._publish, self.say_waiting)
+        self._loop = self._settings.make_loop(simulator, self._publish, self.publish_waiting)
         world = simulator.config.world
         self._world_view = None if world is None else WorldView(self, world)
         self._thread = Thread(target=self._simulate, name="simulation")
@@ -81,10 +87,10 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         self.create_service(Push, "~/push", self._on_push)
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def begin(self) -> None:
-        """Start the simulation, once all that `publish_sample` needs is there."""
+    def start(self) -> None:
+        """Start the simulation; call it when everything that `publish_sample` needs exists."""
         self._publish_ground(self._loop.simulator.config.terrain)
-        gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of a period
+        gc.freeze()  # shortens garbage collections during a period: present objects are permanent
         self._thread.start()
 
     def destroy_node(self) -> None:
@@ -93,60 +99,90 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         self._thread.join()
         super().destroy_node()
 
-    # For those that stand on this.
+    # Interface of the subclasses.
 
     @abstractmethod
     def publish_sample(self, state: RobotState, instant: float, view: bool) -> None:
-        """One sample, in the simulation's thread. view: whether people are to see it."""
+        """Publish one state; called in the thread of the simulation.
+
+        Args:
+            state: State of the robot.
+            instant: Time of the state, s, see `SimulationLoop`.
+            view: Whether topics for display are due, too.
+        """
 
     @abstractmethod
-    def figures(self) -> dict[str, object]:
-        """What else /diagnostics shows."""
+    def diagnostic_values(self) -> dict[str, object]:
+        """Return further values for /diagnostics.
+
+        Returns:
+            Values by name.
+        """
 
     @abstractmethod
-    def worry(self, report: LoopReport) -> str:
-        """What was wrong in the last second beyond the loop, in a few words, or ""."""
+    def warning_text(self, report: LoopReport) -> str:
+        """Return a warning about the last second beyond those of the loop.
 
-    def say_waiting(self, tick: int, instant: float) -> None:
-        """Say that time stands still at `tick`, in the simulation's thread; a robot that has no words for that keeps silent."""
+        Args:
+            report: Statistics of the loop.
+
+        Returns:
+            Short text; empty without a warning.
+        """
+
+    def publish_waiting(self, tick: int, instant: float) -> None:
+        """Report that simulated time stands still; the default does nothing.
+
+        Args:
+            tick: Tick at which time stands still.
+            instant: Present time, s.
+        """
 
     def stamp(self, instant: float) -> Any:
-        """The instant of a sample as a message; in real time in the time of the system clock."""
+        """Convert the time of a sample to a ROS time message.
+
+        Args:
+            instant: Time of the sample, s; in real time it is converted to the system clock.
+
+        Returns:
+            A builtin_interfaces/Time.
+        """
         if self._loop.mode == REALTIME:
             return self._system_time.stamp(instant)
         return as_time(round(instant * 1e9))
 
     def _publish_ground(self, terrain: Terrain) -> None:
-        """The ground in the frame odom, once, for who looks; flat ground everybody can imagine."""
+        """Publish the ground as a latched marker in the frame odom; delete it if it is flat."""
         flat = terrain.kind == "flat"
         marker = Marker(ns="ground", type=Marker.TRIANGLE_LIST, action=Marker.DELETE if flat else Marker.ADD)
         marker.header.frame_id = ODOM
         marker.pose.orientation.w = marker.scale.x = marker.scale.y = marker.scale.z = 1.0
-        marker.color.r, marker.color.g, marker.color.b, marker.color.a = GROUND_COLOUR
-        step = GROUND_STEP if terrain.kind == "rough" else GROUND_SIZE
-        corners = [] if flat else terrain.triangles(GROUND_SIZE, step).tolist()
+        marker.color.r, marker.color.g, marker.color.b, marker.color.a = GROUND_RGBA
+        step = GROUND_SPACING_M if terrain.kind == "rough" else GROUND_SIZE_M
+        corners = [] if flat else terrain.triangles(GROUND_SIZE_M, step).tolist()
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in corners]
         self._ground.publish(marker)
 
     # In the simulation's thread.
 
     def _simulate(self) -> None:
+        """Run the loop; keep its error for `_report`."""
         try:
-            if self._loop.mode == REALTIME:  # elsewhere nothing has to keep up with a clock
+            if self._loop.mode == REALTIME:  # other modes need no real-time scheduling
                 self._settings.apply(self.get_logger().warning)
             self._loop.run()
-        except Exception as error:  # whatever it was, the node must not go on without its robot
+        except Exception as error:  # the node must not continue without its robot
             self._failure = f"{type(error).__name__}: {error}"
 
     def _publish(self, state: RobotState, instant: float) -> None:
         if not self.context.ok():
             self._loop.stop()
             return
-        view = self._samples % max(1, VIEW_PERIOD // self._settings.period) == 0
+        view = self._samples % max(1, VIEW_PERIOD_MS // self._settings.period) == 0
         self.publish_sample(state, instant, view)
         if self._world_view is not None:
             self._world_view.publish(self.stamp(instant), self._loop.simulator, view)
-        if self._samples % max(1, TRUTH_PERIOD // self._settings.period) == 0:
+        if self._samples % max(1, TRUTH_PERIOD_MS // self._settings.period) == 0:
             transform = view and self._settings.publish_tf
             self._publish_truth(self.stamp(instant), self._loop.simulator.truth(), transform)
         self._samples += 1
@@ -169,51 +205,51 @@ class SimulationNode(Node, ABC, Generic[Settings]):
     def _on_reset(self, request: Any, response: Any) -> Any:
         keyframe, terrain = request.keyframe or "lie", request.terrain
         done = f"the robot is back in posture {keyframe}" + (f", on {terrain} ground" if terrain else "")
-        return self._carry_out(response, done, self._reset, keyframe, terrain, request.slope)
+        return self._respond(response, done, self._reset, keyframe, terrain, request.slope)
 
     def _reset(self, keyframe: str, terrain: str, slope: float) -> None:
-        """Put the robot back, on other ground where that has a name: in a simulator of its own."""
+        """Reset the robot; a terrain name replaces the simulator."""
         if not terrain:
             self._loop.reset(keyframe)
             return
-        ground = self._settings.ground(terrain, slope)
+        ground = self._settings.make_terrain(terrain, slope)
         config = attrs.evolve(self._loop.simulator.config, terrain=ground)
         self._loop.reset(keyframe, self._make_simulator(config))
         self._publish_ground(ground)
 
     def _on_pause(self, request: Any, response: Any) -> Any:
         done = "paused" if request.data else "running"
-        return self._carry_out(response, done, self._loop.pause, request.data)
+        return self._respond(response, done, self._loop.pause, request.data)
 
     def _on_step(self, request: Any, response: Any) -> Any:
-        return self._carry_out(response, f"advances by {request.steps} ms", self._loop.step, request.steps)
+        return self._respond(response, f"advances by {request.steps} ms", self._loop.step, request.steps)
 
     def _on_push(self, request: Any, response: Any) -> Any:
         force, torque = ([v.x, v.y, v.z] for v in (request.wrench.force, request.wrench.torque))
         body = request.body or "trunk"
-        return self._carry_out(
+        return self._respond(
             response, f"{body} is pushed", self._loop.push, body, force, torque, request.duration
         )
 
-    def _carry_out(self, response: Any, done: str, order: Any, *arguments: Any) -> Any:
-        """Carry out an order, and tell the caller and the log how it went."""
+    def _respond(self, response: Any, success_text: str, action: Any, *arguments: Any) -> Any:
+        """Execute an action; report its success or its error to caller and log."""
         try:
-            order(*arguments)
-            response.success, response.message = True, done
-            self.get_logger().info(done)
+            action(*arguments)
+            response.success, response.message = True, success_text
+            self.get_logger().info(success_text)
         except ValueError as error:
             response.success, response.message = False, str(error)
             self.get_logger().warning(f"refused: {error}")
         return response
 
     def _report(self) -> None:
-        """Once a second: how the simulation does."""
+        """Publish the diagnostics of the last second."""
         if self._failure:
             request_exit(self, f"{self.get_name()}: {self._failure}")
             return
         report = self._loop.report()
-        worry = self.worry(report)
-        level, summary = self._judge(report, worry)
+        warning = self.warning_text(report)
+        level, summary = self._level_and_summary(report, warning)
         values = {
             "mode": self._loop.mode,
             "actuator": self._settings.actuator_file or "the shipped AlienGo (Table 4)",
@@ -223,32 +259,32 @@ class SimulationNode(Node, ABC, Generic[Settings]):
             "unanswered": report.unanswered,
             "braking": report.braking,
             "fallen": report.fallen,
-            **self._in_world(report),
-            **self.figures(),
+            **self._world_values(report),
+            **self.diagnostic_values(),
         }
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
-        if worry:
-            self.get_logger().warning(worry, throttle_duration_sec=QUIET)
-        if slow := self._slowness.line(monotonic(), report.given_up):
+        if warning:
+            self.get_logger().warning(warning, throttle_duration_sec=QUIET)
+        if slow := self._slowness.next_line(monotonic(), report.given_up):
             self.get_logger().warning(slow)
         if report.fallen and not self._has_fallen:
             self.get_logger().warning("the robot has fallen, or lies down: ~/reset puts it back")
         self._has_fallen = report.fallen
 
-    def _in_world(self, report: LoopReport) -> dict[str, object]:
-        """What /diagnostics shows of a world, if there is one."""
+    def _world_values(self, report: LoopReport) -> dict[str, object]:
+        """Return the diagnostic values of a world, if there is one."""
         if self._world_view is None:
             return {}
-        touched = ", ".join(f"{name} {count}" for name, count in sorted(report.touched.items()))
+        touched = ", ".join(f"{name} {count}" for name, count in sorted(report.touch_counts.items()))
         return {"world": self._settings.world, "touched": touched or "nothing"}
 
-    def _judge(self, report: LoopReport, worry: str) -> tuple[bytes, str]:
-        """Level and summary of the last second."""
+    def _level_and_summary(self, report: LoopReport, warning: str) -> tuple[bytes, str]:
+        """Return diagnostic level and summary of the last second."""
         given_up = report.given_up - self._given_up_before
         self._given_up_before = report.given_up
-        if worry:
-            return DiagnosticStatus.WARN, worry
+        if warning:
+            return DiagnosticStatus.WARN, warning
         if given_up:
             return DiagnosticStatus.WARN, f"this machine is too slow: {given_up:.2f} s of real time given up"
         if self._loop.paused:

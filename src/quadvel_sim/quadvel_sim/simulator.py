@@ -1,11 +1,12 @@
-"""One AlienGo in MuJoCo, driven as the real one is: joint commands in, low-level state out. No ROS, no clock.
+"""Simulation of one AlienGo in MuJoCo: joint commands in, low-level state out. No ROS, no clock.
 
-Every millisecond the drives' law is evaluated on the joint state of that instant with the command held
-(`ActuatorModel`), whenever that command came.
+The actuator model (`ActuatorModel`) is evaluated every millisecond with the joint state of that
+instant and the active command.
 
-What one `RobotState` reports holds at one instant t: q, dq, orientation and angular velocity are those of t,
-`tau` is the torque with which the drives answer them under the command they hold, and linear acceleration and
-foot forces follow from all these. A command given at t counts from t on.
+All quantities of a `RobotState` belong to one instant t. `q`, `dq`, orientation and angular
+velocity are measured at t. `tau` is the response of the drives to them under the active command;
+linear acceleration and foot forces follow from these. A command that is given at t is active from t
+on.
 """
 
 from __future__ import annotations
@@ -32,58 +33,79 @@ from quadvel_sim.world import SURFACE_PRIORITY
 
 __all__ = ["DT", "SensorNoise", "Simulator", "SimulatorConfig", "Truth"]
 
-DT = 0.001  # s
-_TICKS = 2**32
-_PAYLOAD_RADIUS = 0.05  # m, the payload is a solid ball
+DT = 0.001
+"""Time step, s."""
+_TICK_MODULUS = 2**32
+_PAYLOAD_RADIUS_M = 0.05  # the payload is a solid sphere: I = 2/5 m r^2
 _Array = NDArray[np.float64]
 # q, kp, kd, dq, tau, in the order of ActuatorModel.step
-_Law = tuple[_Array, _Array, _Array, _Array | float, _Array | float]
+_CommandArrays = tuple[_Array, _Array, _Array, _Array | float, _Array | float]
 
 
 @attrs.define
 class Truth:
-    """What no sensor tells: the trunk's motion and the contacts at `time`."""
+    """Ground truth of the trunk's motion and of the contacts at one instant.
 
-    time: float  # s
-    tick: int  # ms, wraps at 2^32
-    position: _Array  # (3,) m, trunk origin, world
-    quaternion: _Array  # (4,) w, x, y, z, body to world
-    linear_velocity: _Array  # (3,) m/s, of the trunk origin, body frame
-    angular_velocity: _Array  # (3,) rad/s, body frame
-    contact: NDArray[np.bool_]  # (4,) whether the foot touches the ground
-    contact_force: _Array  # (4, 3) N, ground on foot, world
+    Attributes:
+        time: Simulated time since the reset, s.
+        tick: The same in ms; wraps at 2^32.
+        position: Trunk origin in the world frame, (3,), m.
+        quaternion: Orientation, body to world, (4,), (w, x, y, z).
+        linear_velocity: Velocity of the trunk origin in the body frame, (3,), m/s.
+        angular_velocity: Angular velocity in the body frame, (3,), rad/s.
+        contact: Whether each foot touches the ground, (4,).
+        contact_force: Force of the ground on each foot in the world frame, (4, 3), N.
+    """
+
+    time: float
+    tick: int
+    position: _Array
+    quaternion: _Array
+    linear_velocity: _Array
+    angular_velocity: _Array
+    contact: NDArray[np.bool_]
+    contact_force: _Array
 
 
 @attrs.define
 class _Push:
+    """A push that is under way."""
+
     body: int
     wrench: _Array  # (6,) force and torque, world
-    steps: int  # left
+    steps_left: int  # left
 
 
 def build_model(config: SimulatorConfig) -> mujoco.MjModel:
-    """The robot and its ground as `config` wants them."""
+    """Compile robot, ground, world and payload.
+
+    Args:
+        config: Configuration of the simulation.
+
+    Returns:
+        The compiled model.
+    """
     plant = Plant(
         timestep=DT,
         armature=config.armature,
         joint_friction=config.joint_friction,
         joint_damping=config.joint_damping,
         plane=False,
-        hung=config.hung,
+        suspended=config.suspended,
     )
     spec = build_spec(plant)
     if config.world is None:
         config.terrain.add_to(spec)
     else:
         config.world.add_to(spec)
-        persons.add_to(spec, config.world.persons)
+        persons.add_persons(spec, config.world.persons)
     if config.payload > 0.0:
         spec.body("trunk").add_body(
             name="payload",
             pos=config.payload_position,
             mass=config.payload,
             ipos=np.zeros(3),
-            inertia=np.full(3, 0.4 * config.payload * _PAYLOAD_RADIUS**2),
+            inertia=np.full(3, 0.4 * config.payload * _PAYLOAD_RADIUS_M**2),
             explicitinertial=True,
         )
     if config.payload < 0.0:
@@ -101,21 +123,34 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
         foot.condim,
     )  # friction alone is a surface's own
     disable = mujoco.mjtDisableBit
-    model.opt.disableflags |= disable.mjDSBL_AUTORESET  # a diverged run is an error, not a new start
-    model.opt.disableflags |= disable.mjDSBL_ISLAND  # the robot is one island; finding that out costs 10 %
+    model.opt.disableflags |= disable.mjDSBL_AUTORESET  # a diverged run is an error, not a restart
+    model.opt.disableflags |= disable.mjDSBL_ISLAND  # one island always; the search costs 10 %
     return model
 
 
 class Simulator:
-    """The robot on its ground, 1 ms a step. Equal configurations, seeds and calls give equal runs to the bit.
+    """Simulated robot on its ground with a step of 1 ms.
 
-    Reading (`state`, `truth`, `fallen`) does not alter the run, the sensor noise of later samples apart. The
-    first reading at an instant settles it: a command or push given after that shows from the next step on.
-    `model` and `data` are MuJoCo's own, to be drawn and measured, not to be written to. `steps` counts the ms
-    since the reset, `actuator` is the drives' model.
+    Deterministic: equal configurations, seeds and calls give bitwise equal runs.
+
+    Reading (`state`, `truth`, `fallen`) does not change the run, except for the noise of later
+    samples. The first reading at an instant fixes it: a later command or push shows from the next
+    step on.
+
+    Attributes:
+        config: Configuration of the simulation.
+        model: MuJoCo's model, to be drawn and measured, not changed.
+        data: MuJoCo's state, to be drawn and measured, not changed.
+        steps: Simulated time since the reset, ms.
+        actuator: Model of the drives.
     """
 
     def __init__(self, config: SimulatorConfig | None = None) -> None:
+        """Compile the model and reset the robot.
+
+        Args:
+            config: Configuration; None: the nominal robot on flat ground.
+        """
         self.config = config or SimulatorConfig()
         self.model = build_model(self.config)
         self.data = mujoco.MjData(self.model)
@@ -129,16 +164,21 @@ class Simulator:
         self._ground = np.array([is_ground(self.model.geom(i).name) for i in range(self.model.ngeom)])
         self._fall_cosine = np.cos(self.config.fall_tilt)
         self._watchdog_steps = round(self.config.watchdog / DT)
-        self._brake = _law(JointCommand.damping(self.config.watchdog_kd))
+        self._brake_command = _command_arrays(JointCommand.damping(self.config.watchdog_kd))
         world = self.config.world
         self._surroundings = None if world is None else Surroundings(self.model, world)
         self._noise = np.repeat(attrs.astuple(self.config.noise), (12, 12, 3, 3, 3))
         self.reset()
 
     def reset(self, keyframe: str = "lie", seed: int | None = None) -> None:
-        """Put the robot at the origin in the posture "lie" or "stand", at rest, time zero, drives braking.
+        """Put the robot at the origin, at rest, with time zero and braking drives.
 
-        `seed` of the noise: the configuration's where None, so that the same run comes again.
+        Args:
+            keyframe: Posture, `lie` or `stand`.
+            seed: Seed of the noise; None: the seed of the configuration, which repeats the run.
+
+        Raises:
+            ValueError: The keyframe is unknown.
         """
         keyframes = [self.model.key(i).name for i in range(self.model.nkey)]
         if keyframe not in keyframes:
@@ -148,7 +188,7 @@ class Simulator:
         self.actuator = self._make_actuator(int(seeds[0]))
         self._rng = np.random.default_rng(seeds[1])
         mujoco.mj_resetDataKeyframe(self.model, self.data, self.model.key(keyframe).id)
-        if not self.config.hung:
+        if not self.config.suspended:
             tilt = self.config.terrain.tilt
             self.data.qpos[:3] = rotate(tilt, self.data.qpos[:3])
             self.data.qpos[3:7] = tilt
@@ -156,21 +196,25 @@ class Simulator:
             self._surroundings.reset(self.data, seed)
         self._pushes: list[_Push] = []
         self.steps = 0
-        self._sampled = False
-        self._law = self._brake
-        self._command_left = 0
+        self._is_derived_current = False
+        self._active_command = self._brake_command
+        self._watchdog_left = 0
 
-    def place(
+    def set_state(
         self,
         truth: Truth,
         q: ArrayLike,
         dq: ArrayLike,
         past: Iterable[tuple[ArrayLike, ArrayLike, JointCommand]] = (),
     ) -> None:
-        """Put the robot into a state that another one had: the trunk of `truth`, joints q (12,), dq (12,).
+        """Put the robot into a given state; time and noise continue.
 
-        past: joint state and command of the ms before, the newest last; the drives live through it, so that
-        what is under way in them is there. Time and noise go on.
+        Args:
+            truth: Pose and velocity of the trunk.
+            q: Joint positions, (12,), rad.
+            dq: Joint velocities, (12,), rad/s.
+            past: Joint positions, velocities and command of the preceding ms, the newest last. They
+                restore the internal state of the actuator model, such as delayed commands.
         """
         self.data.qpos[:] = np.concatenate([truth.position, truth.quaternion, q])
         self.data.qvel[:3] = rotate(truth.quaternion, truth.linear_velocity)
@@ -178,12 +222,12 @@ class Simulator:
         self.data.qacc_warmstart[:] = 0.0
         self.actuator.reset()
         for former_q, former_dq, command in past:
-            self.actuator.step(np.asarray(former_q), np.asarray(former_dq), *_law(command))
+            self.actuator.step(np.asarray(former_q), np.asarray(former_dq), *_command_arrays(command))
             self.command(command)
-        self._sampled = False
+        self._is_derived_current = False
 
     def _make_actuator(self, seed: int) -> ActuatorModel:
-        """The drives; a plant with drives of another kind makes them here."""
+        """Create the actuator model; a plant with other drives overrides this."""
         return ActuatorModel(self.config.actuator, dt=DT, seed=seed)
 
     @property
@@ -193,42 +237,53 @@ class Simulator:
 
     @property
     def tick(self) -> int:
-        """`steps` as the board's counter shows it: it wraps at 2^32."""
-        return self.steps % _TICKS
+        """Simulated time since the reset in ms, as the board's counter: it wraps at 2^32."""
+        return self.steps % _TICK_MODULUS
 
     @property
     def braking(self) -> bool:
-        """Whether the drives brake for want of a command."""
-        return self._command_left <= 0
+        """Whether the drives brake because no command arrives."""
+        return self._watchdog_left <= 0
 
     def command(self, command: JointCommand) -> None:
-        """Hold `command` from now on, until the next one or the watchdog.
+        """Set the active command; it stays active until the next one or the watchdog.
 
-        ValueError names the field where one has a wrong length or is not finite, or the mode is unknown.
+        Args:
+            command: Joint command.
+
+        Raises:
+            ValueError: A field has a wrong length or is not finite, or the mode is unknown.
         """
         if command.mode not in (MODE_DAMPING, MODE_SERVO):
             modes = f"{MODE_DAMPING} or {MODE_SERVO}"
             raise ValueError(f"JointCommand.mode: found {command.mode}, expected {modes}")
-        self._law = _law(command)
-        self._command_left = self._watchdog_steps
+        self._active_command = _command_arrays(command)
+        self._watchdog_left = self._watchdog_steps
 
     def step(self, n: int = 1) -> None:
-        """Advance by `n` ms. FloatingPointError where the physics diverged."""
+        """Advance the simulation.
+
+        Args:
+            n: Number of ms.
+
+        Raises:
+            FloatingPointError: The physics diverged.
+        """
         model, data, q, dq = self.model, self.data, self._q, self._dq
         torque, answer, more = data.ctrl, self.actuator.step, self.config.physics.substeps - 1
         surroundings = self._surroundings
         for _ in range(n):
-            torque[:] = answer(q, dq, *self._law)
-            if self._sampled:  # all that depends on positions and velocities alone is there
+            torque[:] = answer(q, dq, *self._active_command)
+            if self._is_derived_current:  # mj_step1 is done: only the second half of the step remains
                 mujoco.mj_step2(model, data)
-                self._sampled = False
+                self._is_derived_current = False
             else:
                 mujoco.mj_step(model, data)
             if more:
                 mujoco.mj_step(model, data, more)
-            self._command_left -= 1
-            if self._command_left == 0:
-                self._law = self._brake
+            self._watchdog_left -= 1
+            if self._watchdog_left == 0:
+                self._active_command = self._brake_command
             if self._pushes:
                 self._end_pushes()
             if surroundings is not None:
@@ -240,9 +295,17 @@ class Simulator:
     def push(
         self, body: str, force: ArrayLike, torque: ArrayLike = (0.0, 0.0, 0.0), duration: float = 0.1
     ) -> None:
-        """Push `body` at its centre of mass for `duration` (s): `force` (N), `torque` (N m), world frame.
+        """Push a body at its centre of mass; pushes add up.
 
-        Pushes add up. ValueError names an unknown body, a wrench that is not finite, a duration under 1 ms.
+        Args:
+            body: Name of the body.
+            force: Force, (3,), N, world frame.
+            torque: Torque, (3,), N m, world frame.
+            duration: Duration, s.
+
+        Raises:
+            ValueError: The body is unknown, the wrench is not finite, or the duration is below 1
+                ms.
         """
         bodies = [self.model.body(i).name for i in range(1, self.model.nbody) if self.model.body_weldid[i]]
         if body not in bodies:
@@ -256,20 +319,26 @@ class Simulator:
         self._apply_pushes()
 
     def _apply_pushes(self) -> None:
+        """Write the sum of all pushes into MuJoCo's state."""
         self.data.xfrc_applied[:] = 0.0
         for push in self._pushes:
             self.data.xfrc_applied[push.body] += push.wrench
 
     def _end_pushes(self) -> None:
+        """Count down the pushes and remove the finished ones."""
         for push in self._pushes:
-            push.steps -= 1
-        if any(push.steps == 0 for push in self._pushes):
-            self._pushes = [push for push in self._pushes if push.steps > 0]
+            push.steps_left -= 1
+        if any(push.steps_left == 0 for push in self._pushes):
+            self._pushes = [push for push in self._pushes if push.steps_left > 0]
             self._apply_pushes()
 
     def state(self) -> RobotState:
-        """What the board reports of this instant, with sensor noise. New arrays."""
-        self._sample()
+        """Simulate the measurements of the board at this instant, with sensor noise.
+
+        Returns:
+            State with new arrays.
+        """
+        self._update_derived()
         foot_force, wrench = np.zeros(4), np.zeros(6)
         for foot, i, _ in self._foot_contacts():
             mujoco.mj_contactForce(self.model, self.data, i, wrench)
@@ -281,15 +350,19 @@ class Simulator:
             q=self._q + noise[:12],
             dq=self._dq + noise[12:24],
             tau=self.data.ctrl.copy(),
-            quaternion=_turned(sensors[self._orientation], noise[30:]),
+            quaternion=_rotated(sensors[self._orientation], noise[30:]),
             angular_velocity=sensors[self._gyro] + noise[24:27],
             linear_acceleration=sensors[self._accelerometer] + noise[27:30],
             foot_force=foot_force,
         )
 
     def truth(self) -> Truth:
-        """The trunk's true motion and the contacts of this instant. New arrays."""
-        self._sample()
+        """Return the true motion of the trunk and the contacts at this instant.
+
+        Returns:
+            Ground truth with new arrays.
+        """
+        self._update_derived()
         contact, force, wrench = np.zeros(4, dtype=bool), np.zeros((4, 3)), np.zeros(6)
         for foot, i, sign in self._foot_contacts():
             mujoco.mj_contactForce(self.model, self.data, i, wrench)
@@ -311,9 +384,9 @@ class Simulator:
     def fallen(self) -> bool:
         """Whether the trunk touches the ground or tilts beyond `fall_tilt` now.
 
-        A robot that lies on its belly counts too: who asks knows whether it should stand.
+        A robot that lies on its belly counts as fallen, too.
         """
-        self._sample()
+        self._update_derived()
         _, x, y, _ = self.data.qpos[3:7]
         upright = 1.0 - 2.0 * (x * x + y * y)  # z component of the trunk's z axis
         if upright < self._fall_cosine:
@@ -322,23 +395,37 @@ class Simulator:
         return bool(((geoms == self._trunk_geom).any(1) & self._ground[geoms].any(1)).any())
 
     @property
-    def touched(self) -> Mapping[str, int]:
-        """How often since the reset the robot touched what stands or walks in its world, by name."""
-        return MappingProxyType({} if self._surroundings is None else self._surroundings.touched)
+    def touch_counts(self) -> Mapping[str, int]:
+        """Number of touches since the reset between robot and objects or people, by name."""
+        return MappingProxyType({} if self._surroundings is None else self._surroundings.touch_counts)
 
     def scan(self) -> Scan | None:
-        """The laser's scan of this instant, or None if none is due since the last one. ValueError without a world."""
+        """Return the laser scan of this instant.
+
+        Returns:
+            The scan; None if no scan is due since the last one.
+
+        Raises:
+            ValueError: There is no world, and so no laser.
+        """
         if self._surroundings is None:
             raise ValueError("scan: found no world, expected SimulatorConfig.world, which has the laser")
-        self._sample()
+        self._update_derived()
         return self._surroundings.scan(self.data)
 
     def persons(self) -> _Array:
-        """Where the world's persons are and where they walk to, (n, 3): x, y in m, yaw in rad, world; who is led first."""
+        """Return position and heading of the people in the world frame.
+
+        Returns:
+            (n, 3): x, y in m, yaw in rad; the followed person first.
+        """
         return np.zeros((0, 3)) if self._surroundings is None else self._surroundings.persons.poses
 
     def _foot_contacts(self) -> list[tuple[int, int, float]]:
-        """The contacts of feet now: index of the foot, index of the contact, and 1, or -1 where its frame shows from the foot."""
+        """Return (foot index, contact index, sign) of each foot contact.
+
+        The sign is -1 if the contact frame points away from the foot.
+        """
         found, feet = [], self._foot_of_geom
         for i, (first, second) in enumerate(self.data.contact.geom.tolist()):
             if second in feet:
@@ -347,22 +434,23 @@ class Simulator:
                 found.append((feet[first], i, -1.0))
         return found
 
-    def _sample(self) -> None:
-        """Bring all that MuJoCo derives from positions, velocities and torques to the present instant.
+    def _update_derived(self) -> None:
+        """Update what MuJoCo derives from positions, velocities and torques to the present instant.
 
-        mj_step leaves it one step behind the positions and velocities that it has just integrated.
+        After mj_step these quantities lag one step behind the integrated positions and velocities.
         """
-        if self._sampled:
+        if self._is_derived_current:
             return
-        self.data.ctrl[:] = self.actuator.peek(self._q, self._dq, *self._law)
+        self.data.ctrl[:] = self.actuator.peek(self._q, self._dq, *self._active_command)
         mujoco.mj_forward(self.model, self.data)
-        self._sampled = True
+        self._is_derived_current = True
 
 
-def _law(command: JointCommand) -> _Law:
-    """The numbers of `command`, copied and checked; where `dq` or `tau` are all zero, the number 0: faster.
+def _command_arrays(command: JointCommand) -> _CommandArrays:
+    """Return checked copies of a command's arrays; all-zero `dq` and `tau` become the number 0.
 
-    ValueError names the field that has not 12 finite numbers.
+    The number 0 is faster in the actuator model. Raises ValueError with the name of a field that
+    does not have 12 finite numbers.
     """
     rows = (command.q, command.kp, command.kd, command.dq, command.tau)
     try:
@@ -379,8 +467,8 @@ def _law(command: JointCommand) -> _Law:
     return q, kp, kd, dq if np.count_nonzero(dq) else 0.0, tau if np.count_nonzero(tau) else 0.0
 
 
-def _turned(quaternion: _Array, rotation: _Array) -> _Array:
-    """`quaternion` (w, x, y, z) turned by a small `rotation` vector (rad) about body axes."""
+def _rotated(quaternion: _Array, rotation: _Array) -> _Array:
+    """Rotate `quaternion` (w, x, y, z) by a small `rotation` vector (rad) about body axes."""
     w, x, y, z = quaternion.tolist()
     a, b, c = (0.5 * rotation).tolist()
     turned = (

@@ -1,4 +1,4 @@
-"""What a log says of a machine that is too slow for real time: the first time at once, then a summary a minute. No ROS."""
+"""Log lines about a machine that is too slow for real time: immediately, then once a minute."""
 
 from __future__ import annotations
 
@@ -8,18 +8,21 @@ SUMMARY_PERIOD_S = 60.0
 
 
 class SlownessLog:
-    """Keeps warnings about lost real time from burying all others in a log."""
+    """Limits the warnings about lost real time, so that other warnings stay visible."""
 
     def __init__(self) -> None:
         self._reported = 0.0  # s of lost real time that a line has reported
         self._next = -inf  # s, before which no line is due
 
-    def line(self, now: float, lost: float) -> str:
-        """The line that is due, or "".
+    def next_line(self, now: float, lost: float) -> str:
+        """Return the line that is due.
 
         Args:
-            now: s, on a clock that is not set back.
-            lost: s of real time that were not simulated, since the start.
+            now: Present time on a clock that is not set back, s.
+            lost: Real time since the start that was not simulated, s.
+
+        Returns:
+            The line, or "".
         """
         new, is_first = lost - self._reported, self._next == -inf
         if new <= 0.0 or now < self._next:

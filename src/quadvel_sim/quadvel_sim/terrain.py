@@ -1,6 +1,6 @@
-"""The ground that the robot walks on: flat, slope, or rough (Perlin noise), as a geom and as a function.
+"""Ground: flat, slope or rough (Perlin noise), as a MuJoCo geom and as a function.
 
-Not for contact parameters: friction belongs to the feet (see `SimulatorConfig.friction`).
+Friction is a property of the feet, see `SimulatorConfig.friction`.
 """
 
 from __future__ import annotations
@@ -16,20 +16,31 @@ from quadvel_sim.checks import number, whole_number
 
 KINDS = ("flat", "slope", "rough")
 GEOM_NAME = "ground"
-_RESOLUTION = 0.05  # m between the points of the height grid
-_LEVEL_RADIUS = 0.5  # m around the origin where rough ground stays level, so that a robot can be put down
-_HILL_LENGTH = 8.0  # m, spacing of the lattice of hills
-_BASE = 0.5  # m of solid ground below the lowest point
+_GRID_SPACING_M = 0.05  # of the height grid
+_LEVEL_RADIUS_M = 0.5  # rough ground is level around the origin, where the robot starts
+_HILL_SPACING_M = 8.0  # of the lattice of hills
+_BASE_THICKNESS_M = 0.5  # of solid ground below the lowest point
 
 
 def perlin(
     x: NDArray[np.float64], y: NDArray[np.float64], wavelength: float, seed: int
 ) -> NDArray[np.float64]:
-    """Gradient noise (Perlin 2002, quintic fade) at `x`, `y` (m, of one shape, >= 0), within [-1, 1].
+    """Compute 2-D gradient noise with quintic fade.
 
-    The lattice of random unit gradients has the spacing `wavelength` (m); equal seeds give equal ground as
-    long as the largest coordinates are equal too.
+    K. Perlin, Improving noise, ACM Transactions on Graphics 21 (3), 2002.
+
+    Args:
+        x: Coordinates, m, >= 0.
+        y: Coordinates of the same shape, m, >= 0.
+        wavelength: Spacing of the lattice of random unit gradients, m.
+        seed: Seed of the gradients. Equal seeds give equal noise if the largest coordinates are
+            equal.
+
+    Returns:
+        Noise in [-1, 1], shape of `x`.
     """
+    # At the lattice corners (j, i): n_ij = g_ij . (u - j, v - i), blended by
+    # fade(t) = 6 t^5 - 15 t^4 + 10 t^3; sqrt(2) scales the result to [-1, 1].
     u, v = x / wavelength, y / wavelength
     column, row = np.floor(u).astype(int), np.floor(v).astype(int)
     angles = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (row.max() + 2, column.max() + 2))
@@ -48,23 +59,33 @@ def perlin(
 
 @attrs.frozen
 class Terrain:
-    """Ground z = x tan(slope) + noise(x, y), world frame; around the origin the noise is zero."""
+    """Ground z = x tan(slope) + noise(x, y) in the world frame; the noise is zero near the origin.
+
+    Raises:
+        ValueError: A value is out of its range, or flat ground has a slope.
+
+    Attributes:
+        kind: `flat`, `slope` or `rough`.
+        slope: Inclination, rad; positive rises along +x. Zero for flat ground.
+        roughness: Amplitude of the noise of rough ground, m.
+        wavelength: Lattice spacing of the noise, m: about the distance from a hump to the next
+            hollow.
+        hills: Amplitude of long hills under the noise of rough ground, m; about 8 m from hill to
+            valley.
+        blend: Distance over which rough ground grows from level to its full roughness, m. A long
+            distance gives a field from easy to hard.
+        size: Edge of the square of rough ground, m. Flat ground and slopes are infinite.
+        seed: Seed of rough ground.
+    """
 
     kind: str = attrs.field(default="flat")
     slope: float = attrs.field(default=0.0, **number(-0.8, 0.8))
-    """Inclination, rad; positive rises along +x. Zero where `kind` is flat."""
     roughness: float = attrs.field(default=0.06, **number(0.001, 1.0))
-    """Bound of the noise of rough ground above and below the slope, m."""
     wavelength: float = attrs.field(default=0.6, **number(0.1, 10.0))
-    """Spacing of the noise's lattice, m: about the distance from a hump to the next hollow."""
     hills: float = attrs.field(default=0.0, **number(0.0, 10.0))
-    """Bound of the hills under the noise of rough ground, m: about 8 m from a hill to the next valley."""
     blend: float = attrs.field(default=0.5, **number(0.1, 100.0))
-    """Distance over which rough ground grows from level to fully rough, m. Long: a field from easy to hard."""
     size: float = attrs.field(default=40.0, **number(4.0, 200.0))
-    """Edge of the square of rough ground, m. Flat ground and slopes have no edge."""
     seed: int = attrs.field(default=0, **whole_number())
-    """Seed of rough ground."""
 
     def __attrs_post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -74,28 +95,36 @@ class Terrain:
 
     @cached_property
     def _heights(self) -> NDArray[np.float64]:
-        """Heights of the grid (rows along y, columns along x), m."""
-        points = round(self.size / _RESOLUTION) + 1
+        """Heights of the grid, m; rows along y, columns along x."""
+        points = round(self.size / _GRID_SPACING_M) + 1
         axis = np.linspace(0.0, self.size, points)
         x, y = np.meshgrid(axis, axis)
         bumps = self.roughness * perlin(x, y, self.wavelength, self.seed)
-        hills = self.hills * perlin(x, y, _HILL_LENGTH, self.seed + 1)
+        hills = self.hills * perlin(x, y, _HILL_SPACING_M, self.seed + 1)
         x, y = x - 0.5 * self.size, y - 0.5 * self.size
-        grown = np.clip((np.hypot(x, y) - _LEVEL_RADIUS) / self.blend, 0.0, 1.0)
+        grown = np.clip((np.hypot(x, y) - _LEVEL_RADIUS_M) / self.blend, 0.0, 1.0)
         return np.asarray(x * np.tan(self.slope) + grown * (bumps + hills))
 
     @property
     def tilt(self) -> NDArray[np.float64]:
-        """Orientation of the ground at the origin, quaternion (w, x, y, z), ground to world."""
+        """Orientation of the ground at the origin, ground to world, (4,), (w, x, y, z)."""
         return np.array([np.cos(0.5 * self.slope), 0.0, -np.sin(0.5 * self.slope), 0.0])
 
     def height(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Height of the ground (m) at `x`, `y` (m, world, shapes that broadcast); past the edge the rim's."""
+        """Interpolate the height of the ground as MuJoCo's height field does.
+
+        Args:
+            x: Coordinates in the world frame, m.
+            y: Coordinates, m; shapes of `x` and `y` broadcast.
+
+        Returns:
+            Height, m; beyond the edge of rough ground the height of the edge.
+        """
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
         if self.kind != "rough":
             return np.asarray(x * np.tan(self.slope))
         heights, last = self._heights, len(self._heights) - 1
-        u, v = (np.clip((c + 0.5 * self.size) / _RESOLUTION, 0.0, last) for c in (x, y))
+        u, v = (np.clip((c + 0.5 * self.size) / _GRID_SPACING_M, 0.0, last) for c in (x, y))
         column, row = (np.minimum(c.astype(int), last - 1) for c in (u, v))
         u, v = u - column, v - row
         # MuJoCo cuts each cell into two triangles along the diagonal from (0, 0) to (1, 1).
@@ -105,9 +134,14 @@ class Terrain:
         return np.asarray(here + np.where(u > v, below, above))
 
     def triangles(self, size: float, step: float) -> NDArray[np.float64]:
-        """The ground in a square about the origin, as people are shown it: each three of the vertices (N, 3), m, are a triangle.
+        """Return the ground in a square about the origin as triangles for display.
 
-        size: edge of the square, m. step: distance of its points, m.
+        Args:
+            size: Edge of the square, m.
+            step: Distance of the grid points, m.
+
+        Returns:
+            Vertices, (N, 3), m; three consecutive ones are a triangle.
         """
         axis = np.linspace(-0.5 * size, 0.5 * size, round(size / step) + 1)
         x, y = np.meshgrid(axis, axis)
@@ -116,7 +150,11 @@ class Terrain:
         return np.stack([here, right, far, here, far, up], axis=2).reshape(-1, 3)
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
-        """Add the ground to the robot's `spec` as the geom `ground` of the world body."""
+        """Add the ground to a model as the geom `ground` of the world body.
+
+        Args:
+            spec: Model that is extended.
+        """
         # The robot's geoms collide with contype 1 alone.
         common = {"name": GEOM_NAME, "contype": 1, "conaffinity": 0, "material": GEOM_NAME}
         if self.kind != "rough":
@@ -128,7 +166,7 @@ class Terrain:
         lowest, spread = heights.min(), np.ptp(heights)
         spec.add_hfield(
             name=GEOM_NAME,
-            size=[0.5 * self.size, 0.5 * self.size, spread, _BASE],
+            size=[0.5 * self.size, 0.5 * self.size, spread, _BASE_THICKNESS_M],
             nrow=heights.shape[0],
             ncol=heights.shape[1],
             userdata=((heights - lowest) / spread).ravel(),

@@ -1,4 +1,4 @@
-"""Persons who walk, as a laser at the height of their shins sees them: two circles that swing in turn."""
+"""Gait model of a person for a laser at shin height: two circles that swing alternately."""
 
 from __future__ import annotations
 
@@ -10,23 +10,37 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-STANCE = 0.6  # of a stride, in which a foot stands
-SHIN = 0.75  # swing of a shin, where it is measured, by that of its foot
-SETTLING = 0.2  # s, in which the swing follows a change of pace
+STANCE_FRACTION = 0.6
+"""Share of a stride in which a foot stands."""
+SHIN_SWING_RATIO = 0.75
+"""Amplitude of the shin at the height of the laser by the amplitude of the foot."""
+SWING_TIME_CONSTANT_S = 0.2
+"""Time constant with which the amplitude follows a change of speed."""
 
 
 def _points(values: ArrayLike) -> Array:
+    """Return a float array of points."""
     return np.asarray(values, float)
 
 
 @attrs.define
 class Walker:
-    """A person on a way of straight pieces.
+    """Person that walks along a polyline.
 
-    way (n, 2): m, from one point to the next, at the last of which it stays, or, where the way is closed, from which it
-    goes on to the first, round after round; travelled: m so far; speed: m/s; waiting: whether it stands; stops: (from, to)
-    in s, times at which it stands; pace: share by which its speed changes, slowly, up and down; radius: m, of a leg;
-    apart: m, of the legs from each other sideways.
+    Attributes:
+        way: Polyline, (n, 2), m.
+        speed: Mean walking speed, m/s.
+        stops: Time intervals (start, end) in s in which the person stands.
+        pace: Relative amplitude of a slow variation of the speed.
+        radius: Radius of a leg, m.
+        apart: Lateral distance between the legs, m.
+        phase: Phase of the stride, 0 to 1.
+        time: Time since the start, s.
+        travelled: Distance walked along the polyline, m.
+        closed: Whether the path continues from the last point to the first; else the person stops
+            at the last point.
+        waiting: Whether the person must stand now.
+        swing: Amplitude of a foot relative to the body, m.
     """
 
     way: Array = attrs.field(converter=_points)
@@ -35,18 +49,22 @@ class Walker:
     pace: float = 0.0
     radius: float = 0.06
     apart: float = 0.2
-    phase: float = 0.0  # of its stride, 0 to 1
+    phase: float = 0.0
     time: float = 0.0
     travelled: float = 0.0
     closed: bool = False
     waiting: bool = False
-    swing: float = attrs.field(default=0.0, init=False)  # m, of a foot before and behind the body
-    _directions: Array = attrs.field(init=False)  # (pieces, 2) of the way
-    _begins: Array = attrs.field(init=False)  # (pieces,) m along the way
+    swing: float = attrs.field(default=0.0, init=False)
+    _directions: Array = attrs.field(init=False)
+    _starts: Array = attrs.field(init=False)
     _ends: Array = attrs.field(init=False)
 
     def step(self, dt: float) -> None:
-        """Walk on for `dt` s."""
+        """Walk for a time step.
+
+        Args:
+            dt: Time step, s.
+        """
         self.time += dt
         standing = (
             self.waiting
@@ -55,8 +73,12 @@ class Walker:
         )
         speed = 0.0 if standing else self.speed * (1.0 + self.pace * np.sin(1.3 * self.time))
         self.travelled += speed * dt
-        period = 1.5 - 0.3 * min(speed, 2.0)  # s a stride
-        self.swing += (0.5 * STANCE * speed * period - self.swing) * min(1.0, dt / SETTLING)
+        # Stride period T(v) = 1.5 s - 0.3 v. A foot on the ground moves by -v relative to the body,
+        # so its amplitude is half of v T times the stance fraction.
+        period = 1.5 - 0.3 * min(speed, 2.0)
+        self.swing += (0.5 * STANCE_FRACTION * speed * period - self.swing) * min(
+            1.0, dt / SWING_TIME_CONSTANT_S
+        )
         if speed > 0.0:
             self.phase = (self.phase + dt / period) % 1.0
 
@@ -66,49 +88,61 @@ class Walker:
         lengths = np.hypot(*pieces.T)
         self._directions = pieces / lengths[:, None]
         self._ends = np.cumsum(lengths)
-        self._begins = self._ends - lengths
+        self._starts = self._ends - lengths
 
     @property
     def length(self) -> float:
-        """Of the way, or of a round, m."""
+        """Length of the path or of a lap, m."""
         return float(self._ends[-1])
 
     @property
     def position(self) -> Array:
-        """Of the body, (2,) in m."""
-        return self._place()[0]
+        """Position of the body, (2,), m."""
+        return self._pose()[0]
 
-    def _place(self) -> tuple[Array, Array]:
-        """Position (2,) and direction (2,)."""
+    def _pose(self) -> tuple[Array, Array]:
+        """Return position (2,) in m and unit direction (2,)."""
         along = self.travelled % self.length if self.closed else min(self.travelled, self.length)
         i = min(int(self._ends.searchsorted(along, side="right")), len(self._ends) - 1)
         direction = self._directions[i]
-        return self.way[i] + (along - self._begins[i]) * direction, direction
+        return self.way[i] + (along - self._starts[i]) * direction, direction
 
     @property
     def heading(self) -> float:
-        """Where it walks to, rad."""
-        ahead = self._place()[1]
+        """Direction of walking, rad."""
+        ahead = self._pose()[1]
         return float(np.arctan2(ahead[1], ahead[0]))
 
     @property
     def legs(self) -> Array:
-        """Circles (2, 3): x, y, radius, m."""
-        body, ahead = self._place()
+        """Circles of left and right leg, (2, 3): x, y, radius, m."""
+        body, ahead = self._pose()
         left = np.array([-ahead[1], ahead[0]])
-        along = SHIN * self.swing * _swing(np.array([self.phase, (self.phase + 0.5) % 1.0]))
+        along = (
+            SHIN_SWING_RATIO * self.swing * _swing_profile(np.array([self.phase, (self.phase + 0.5) % 1.0]))
+        )
         side = 0.5 * self.apart * np.array([1.0, -1.0])
         return np.column_stack(
             [body + along[:, None] * ahead + side[:, None] * left, np.full(2, self.radius)]
         )
 
 
-def _swing(phase: Array) -> Array:
-    """From 1, the foot put down ahead, to -1 as the body passes over it, and back through the air."""
-    air = (phase - STANCE) / (1.0 - STANCE)
-    return np.where(phase < STANCE, 1.0 - 2.0 * phase / STANCE, -np.cos(np.pi * air))
+def _swing_profile(phase: Array) -> Array:
+    """Return the relative position of a foot from 1 (ahead) to -1 (behind) over the phase.
+
+    The stance moves linearly backward relative to the body; the swing is a half cosine.
+    """
+    air = (phase - STANCE_FRACTION) / (1.0 - STANCE_FRACTION)
+    return np.where(phase < STANCE_FRACTION, 1.0 - 2.0 * phase / STANCE_FRACTION, -np.cos(np.pi * air))
 
 
-def circles(walkers: Sequence[Walker]) -> Array:
-    """The legs of all, (2 n, 3)."""
+def leg_circles(walkers: Sequence[Walker]) -> Array:
+    """Return the legs of several people.
+
+    Args:
+        walkers: The n people.
+
+    Returns:
+        Circles, (2 n, 3): x, y, radius, m.
+    """
     return np.concatenate([walker.legs for walker in walkers]) if walkers else np.zeros((0, 3))

@@ -1,7 +1,7 @@
-"""A world around the robot: ground, walls, trees, tables, persons and the robot's laser, from a YAML file.
+"""World around the robot from a YAML file: ground, walls, trees, tables, people, laser.
 
-The robot starts at the origin, on level ground, looking along x. What a world does while time passes is the matter of
-`persons` and `simulator`; here stands what it is, and how its geoms come into a model.
+The robot starts at the origin on level ground and faces along x. This module describes a world and
+adds its geoms to a model; `surroundings` and `persons` simulate what changes with time.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description.bounded_yaml import read_yaml
 from quadvel_sim.checks import number, numbers, one_of, or_none, points, truth_value, whole_number
-from quadvel_sim.laser import SEEN, Laser
+from quadvel_sim.laser import LASER_VISIBLE_GROUP, Laser
 from quadvel_sim.terrain import GEOM_NAME, perlin
 
 Array = NDArray[np.float64]
 
 SCHEMA = 1
-FOLDER = Path(__file__).parent / "worlds"
-SHIPPED = ("corridor", "park", "campus")
-LOW = 0
-"""Group of what lies so low that a laser need not see it"""
-MOST_SOLIDS = 2_000
-"""Boxes, cylinders and meshes of a world; more make the simulation of contacts and rays too slow"""
-MOST_PERSONS = 50
-MOST_HEIGHTS = 4_000_000
-"""Points of the bumps of all patches: 100 m x 100 m"""
+WORLDS_FOLDER = Path(__file__).parent / "worlds"
+SHIPPED_WORLDS = ("corridor", "park", "campus")
+LOW_GEOM_GROUP = 0
+"""MuJoCo group of low geoms that a laser does not see."""
+MAX_SOLIDS = 2_000
+"""Largest number of boxes, cylinders and meshes: more make contacts and rays too slow."""
+MAX_PERSONS = 50
+MAX_HEIGHT_POINTS = 4_000_000
+"""Largest number of height points of all patches: 100 m x 100 m."""
 SURFACE_PRIORITY = 2
-"""Of geoms of grass, gravel and hills, above the feet's 1: the surface tells the friction"""
-STEEPEST = 15.0  # deg
-_DEEP = 0.3  # m, by which what stands on the ground goes into it
-_STEP = 0.05  # m between the points of a patch's heights
-_RIM = 0.005  # m, of a patch above the ground around it
-_LEG_RADIUS, _BOARD = 0.025, 0.03  # m, of tables
-_ARC = 8  # points of a turn
-_SOLREF = (0.01, 1.0)  # of all contacts, as the robot's own
+"""MuJoCo priority of surfaces: above the feet's 1, so the surface sets the friction."""
+MAX_HILL_SLOPE_DEG = 15.0
+_FOUNDATION_DEPTH_M = 0.3  # of objects in the ground
+_PATCH_SPACING_M = 0.05  # of the height points of a patch
+_RIM_HEIGHT_M = 0.005  # of a patch above the ground around it
+_TABLE_LEG_RADIUS_M, _BOARD_THICKNESS_M = 0.025, 0.03
+_ARC_POINTS = 8  # of a rounded corner
+_SOLREF = (0.01, 1.0)  # contact time constant (s) and damping ratio, as those of the robot
 _BOX, _CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
-_COLOURS = {
+_RGBA = {
     "grass": (0.33, 0.5, 0.25, 1.0),
     "gravel": (0.6, 0.57, 0.52, 1.0),
     "paved": (0.45, 0.46, 0.48, 1.0),
@@ -57,7 +57,13 @@ _COLOURS = {
 
 @attrs.frozen
 class Surface:
-    """What one walks on: friction of a foot on it; height of its bumps and their distance, m."""
+    """Properties of a ground surface.
+
+    Attributes:
+        friction: Sliding friction coefficient of a foot on it.
+        bumps: Height of its bumps, m.
+        wavelength: Distance of its bumps, m.
+    """
 
     friction: float
     bumps: float
@@ -73,183 +79,254 @@ SURFACES = {
 
 @attrs.frozen(eq=False, kw_only=True)
 class Wall:
-    """A wall from point to point."""
+    """Wall along a polyline.
+
+    Attributes:
+        points: Corners, (n, 2), m.
+        height: Height, m.
+        thickness: Thickness, m.
+    """
 
     points: Array = attrs.field(**points(2))
     height: float = attrs.field(default=2.5, **number(0.05, 50.0))
     thickness: float = attrs.field(default=0.1, **number(0.01, 5.0))
 
     def add_to(self, spec: mujoco.MjSpec, name: str, world: World) -> None:
-        """One box a piece; they meet at the corners."""
+        """Add a box per segment; boxes overlap at the corners.
+
+        Args:
+            spec: Model that is extended.
+            name: Name of the geom or its prefix.
+            world: World with the height of the ground.
+        """
         for k, (begin, end) in enumerate(itertools.pairwise(self.points)):
             centre, side = 0.5 * (begin + end), end - begin
             size = [float(np.hypot(*side)) + self.thickness, self.thickness, self.height]
             part = f"{name}_{k}" if len(self.points) > 2 else name
             yaw = float(np.arctan2(side[1], side[0]))
-            world._upright(spec, part, _BOX, centre, size, yaw, _COLOURS["wall"])
+            world._add_upright(spec, part, _BOX, centre, size, yaw, _RGBA["wall"])
 
 
 @attrs.frozen(eq=False, kw_only=True)
 class Box:
-    """A box that stands on the ground: a bench, a kiosk, a parked car."""
+    """Box on the ground: a bench, a kiosk, a parked car.
+
+    Attributes:
+        position: Centre, (2,), m.
+        size: Length, width and height, (3,), m.
+        yaw: Orientation, deg.
+    """
 
     position: Array = attrs.field(**numbers(2))
     size: Array = attrs.field(**numbers(3, low=0.01))
-    """Along, across and up, m."""
     yaw: float = attrs.field(default=0.0, **number(-360.0, 360.0))
-    """deg"""
 
     def add_to(self, spec: mujoco.MjSpec, name: str, world: World) -> None:
-        """One geom."""
+        """Add a box.
+
+        Args:
+            spec: Model that is extended.
+            name: Name of the geom.
+            world: World with the height of the ground.
+        """
         yaw = np.radians(self.yaw)
-        world._upright(spec, name, _BOX, self.position, self.size, yaw, _COLOURS["box"])
+        world._add_upright(spec, name, _BOX, self.position, self.size, yaw, _RGBA["box"])
 
 
 @attrs.frozen(eq=False, kw_only=True)
 class Trees:
-    """Trunks of trees, or posts, of one size."""
+    """Trunks of trees, or posts, of one size.
+
+    Attributes:
+        positions: Centres, (n, 2), m.
+        radius: Radius, m.
+        height: Height, m.
+    """
 
     positions: Array = attrs.field(**points(1))
     radius: float = attrs.field(default=0.15, **number(0.01, 3.0))
     height: float = attrs.field(default=3.0, **number(0.05, 50.0))
 
     def add_to(self, spec: mujoco.MjSpec, name: str, world: World) -> None:
-        """One cylinder each."""
+        """Add a cylinder per trunk.
+
+        Args:
+            spec: Model that is extended.
+            name: Prefix of the geom names.
+            world: World with the height of the ground.
+        """
         size = [self.radius, self.radius, self.height]
         for k, position in enumerate(self.positions):
-            world._upright(spec, f"{name}_{k}", _CYLINDER, position, size, 0.0, _COLOURS["tree"])
+            world._add_upright(spec, f"{name}_{k}", _CYLINDER, position, size, 0.0, _RGBA["tree"])
 
 
 @attrs.frozen(eq=False, kw_only=True)
 class Table:
-    """A board on four legs."""
+    """Table: a board on four legs.
+
+    Attributes:
+        position: Centre, (2,), m.
+        size: Length and width, (2,), m.
+        height: Height of the upper side of the board, m.
+        yaw: Orientation, deg.
+    """
 
     position: Array = attrs.field(**numbers(2))
     size: Array = attrs.field(default=(1.4, 0.7), **numbers(2, low=0.1))
-    """Along and across, m."""
     height: float = attrs.field(default=0.74, **number(0.1, 3.0))
     yaw: float = attrs.field(default=0.0, **number(-360.0, 360.0))
-    """deg"""
 
     def add_to(self, spec: mujoco.MjSpec, name: str, world: World) -> None:
-        """Four cylinders and a box."""
+        """Add four cylinders and a box.
+
+        Args:
+            spec: Model that is extended.
+            name: Name of the board, prefix of the legs' names.
+            world: World with the height of the ground.
+        """
         yaw = np.radians(self.yaw)
         for k, corner in enumerate(self.legs):
-            size = [_LEG_RADIUS, _LEG_RADIUS, self.height - _BOARD]
-            world._upright(spec, f"{name}_leg_{k}", _CYLINDER, corner, size, yaw, _COLOURS["table"])
-        below = float(world.height(*self.position)) + self.height - _BOARD
-        world._add(
+            size = [_TABLE_LEG_RADIUS_M, _TABLE_LEG_RADIUS_M, self.height - _BOARD_THICKNESS_M]
+            world._add_upright(spec, f"{name}_leg_{k}", _CYLINDER, corner, size, yaw, _RGBA["table"])
+        below = float(world.height(*self.position)) + self.height - _BOARD_THICKNESS_M
+        world._add_geom(
             spec,
             name,
             type=_BOX,
-            pos=[*self.position, below + 0.5 * _BOARD],
-            size=[0.5 * self.size[0], 0.5 * self.size[1], 0.5 * _BOARD],
-            quat=_about_z(yaw),
-            rgba=_COLOURS["table"],
+            pos=[*self.position, below + 0.5 * _BOARD_THICKNESS_M],
+            size=[0.5 * self.size[0], 0.5 * self.size[1], 0.5 * _BOARD_THICKNESS_M],
+            quat=_quaternion_about_z(yaw),
+            rgba=_RGBA["table"],
         )
 
     @property
     def legs(self) -> Array:
-        """Where they stand, (4, 2), m."""
-        inwards = 0.5 * self.size - 2.0 * _LEG_RADIUS
+        """Positions of the legs, (4, 2), m."""
+        inwards = 0.5 * self.size - 2.0 * _TABLE_LEG_RADIUS_M
         corners = inwards * [[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]
         return np.asarray(self.position + corners @ _rotation(np.radians(self.yaw)).T)
 
 
 @attrs.frozen(eq=False, kw_only=True)
 class Patch:
-    """A rectangle of another ground on the level: grass or gravel, with bumps. Lasers look over them."""
+    """Rectangle of grass or gravel with bumps on level ground; lasers do not see it.
+
+    Attributes:
+        surface: `grass` or `gravel`.
+        position: Centre, (2,), m.
+        size: Length and width, (2,), m.
+        yaw: Orientation, deg.
+        friction: Sliding friction coefficient of a foot; None: that of the surface.
+        bumps: Height of the bumps, m; None: that of the surface.
+    """
 
     surface: str = attrs.field(**one_of(["grass", "gravel"]))
     position: Array = attrs.field(**numbers(2))
-    """Of its middle, m."""
     size: Array = attrs.field(**numbers(2, low=0.5))
-    """Along and across, m."""
     yaw: float = attrs.field(default=0.0, **number(-360.0, 360.0))
-    """deg"""
     friction: float | None = attrs.field(default=None, **or_none(number(0.05, 3.0)))
-    """Of a foot on it; where nothing is said, the surface's."""
     bumps: float | None = attrs.field(default=None, **or_none(number(0.006, 0.2)))
-    """Height of its bumps, m; where nothing is said, the surface's."""
 
     def add_to(self, spec: mujoco.MjSpec, name: str, world: World) -> None:
-        """A height field."""
+        """Add a height field.
+
+        Args:
+            spec: Model that is extended.
+            name: Name of the geom.
+            world: World with the seed of the bumps.
+        """
         heights = self._heights(world.seed + 1 + world.patches.index(self))
         top = float(heights.max())
         spec.add_hfield(
             name=name,
-            size=[0.5 * self.size[0], 0.5 * self.size[1], top, _DEEP],
+            size=[0.5 * self.size[0], 0.5 * self.size[1], top, _FOUNDATION_DEPTH_M],
             nrow=heights.shape[0],
             ncol=heights.shape[1],
             userdata=(heights / top).ravel(),
         )
         friction = SURFACES[self.surface].friction if self.friction is None else self.friction
-        world._add(
+        world._add_geom(
             spec,
             name,
             type=mujoco.mjtGeom.mjGEOM_HFIELD,
             hfieldname=name,
             pos=[*self.position, 0.0],
-            quat=_about_z(np.radians(self.yaw)),
+            quat=_quaternion_about_z(np.radians(self.yaw)),
             friction=[friction, 0.02, 0.01],
             priority=SURFACE_PRIORITY,
-            group=LOW,
-            rgba=_COLOURS[self.surface],
+            group=LOW_GEOM_GROUP,
+            rgba=_RGBA[self.surface],
         )
 
     @property
-    def count(self) -> float:
-        """Number of points of its bumps."""
-        return float(np.prod(self.size / _STEP + 1.0))
+    def point_count(self) -> float:
+        """Number of points of the height field."""
+        return float(np.prod(self.size / _PATCH_SPACING_M + 1.0))
 
     def _heights(self, seed: int) -> Array:
-        """From a rim to the bumps, rows across, columns along, m."""
+        """Return heights that grow from the rim to the bumps, m; rows across, columns along."""
         surface = SURFACES[self.surface]
         bumps = surface.bumps if self.bumps is None else self.bumps
-        along, across = (np.linspace(0.0, length, round(length / _STEP) + 1) for length in self.size)
+        along, across = (
+            np.linspace(0.0, length, round(length / _PATCH_SPACING_M) + 1) for length in self.size
+        )
         x, y = np.meshgrid(along, across)
         inside = np.minimum(np.minimum(x, self.size[0] - x), np.minimum(y, self.size[1] - y))
         grown = np.clip(inside / surface.wavelength, 0.0, 1.0)
         noise = 0.5 * (1.0 + perlin(x, y, surface.wavelength, seed))
-        return np.asarray(_RIM + grown * (bumps - _RIM) * noise)
+        return np.asarray(_RIM_HEIGHT_M + grown * (bumps - _RIM_HEIGHT_M) * noise)
 
 
 @attrs.frozen(eq=False, kw_only=True)
 class Hill:
-    """A rectangular mound with a level top: up it, over it and down again; slopes on all four sides."""
+    """Rectangular mound with a level top and slopes on all four sides.
+
+    Raises:
+        ValueError: A value is out of its range, or opposite slopes meet below `height`.
+
+    Attributes:
+        position: Centre, (2,), m.
+        size: Length and width of the foot, (2,), m.
+        height: Height of the level top, m.
+        slope: Inclination of the slopes along its length, deg.
+        sides: Inclination of the slopes across it, deg; None: the same as `slope`.
+        yaw: Orientation, deg.
+        surface: Surface that sets friction and colour.
+    """
 
     position: Array = attrs.field(**numbers(2))
-    """Of its middle, m."""
     size: Array = attrs.field(**numbers(2, low=1.0))
-    """Of its foot, along and across, m."""
     height: float = attrs.field(**number(0.02, 20.0))
-    slope: float = attrs.field(**number(1.0, STEEPEST))
-    """Up it and down again along its length, deg."""
+    slope: float = attrs.field(**number(1.0, MAX_HILL_SLOPE_DEG))
     sides: float | None = attrs.field(default=None, **or_none(number(1.0, 60.0)))
-    """Slopes across it, deg; where nothing is said, the same."""
     yaw: float = attrs.field(default=0.0, **number(-360.0, 360.0))
-    """deg"""
     surface: str = attrs.field(default="paved", **one_of(list(SURFACES)))
 
     def __attrs_post_init__(self) -> None:
         highest = 0.98 * float((0.5 * self.size * self.steepness).min())
         if self.height > highest:
             raise ValueError(
-                f"Hill.height: found {self.height:g}, expected at most {highest:.3g}, as slopes of its size meet above that"
+                f"Hill.height: found {self.height:g}, expected at most {highest:.3g}, where its slopes meet"
             )
 
     @property
     def steepness(self) -> Array:
-        """Rise a metre along it and across it, (2,)."""
+        """Slope along and across, (2,), m/m."""
         return np.tan(np.radians([self.slope, self.slope if self.sides is None else self.sides]))
 
     @property
     def top(self) -> Array:
-        """Along and across, of its level top, (2,), m."""
+        """Length and width of the level top, (2,), m."""
         return np.asarray(self.size - 2.0 * self.height / self.steepness)
 
     def add_to(self, spec: mujoco.MjSpec, name: str, world: World) -> None:
-        """A convex mesh of the corners of foot and top."""
+        """Add a convex mesh between the corners of foot and top.
+
+        Args:
+            spec: Model that is extended.
+            name: Name of the geom.
+            world: The world.
+        """
         foot = 0.5 * self.size * [[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]
         top = 0.5 * self.top * np.sign(foot)
         corners = np.vstack(
@@ -257,46 +334,53 @@ class Hill:
         )
         turn = np.eye(3)
         turn[:2, :2] = _rotation(np.radians(self.yaw))
-        below = np.column_stack([foot, np.full(4, -_DEEP)])
+        below = np.column_stack([foot, np.full(4, -_FOUNDATION_DEPTH_M)])
         vertices = np.vstack([below, corners]) @ turn.T + [*self.position, 0.0]
         spec.add_mesh(name=name, uservert=vertices.ravel())
-        world._add(
+        world._add_geom(
             spec,
             name,
             type=mujoco.mjtGeom.mjGEOM_MESH,
             meshname=name,
             friction=[SURFACES[self.surface].friction, 0.02, 0.01],
             priority=SURFACE_PRIORITY,
-            rgba=_COLOURS[self.surface],
+            rgba=_RGBA[self.surface],
         )
 
 
 @attrs.frozen(eq=False, kw_only=True)
 class Person:
-    """Somebody who walks; see `persons` for how."""
+    """A walking person; `persons` simulates it.
+
+    Raises:
+        ValueError: A value is out of its range, or `speeds` or `stops` are no ascending pairs.
+
+    Attributes:
+        way: Corners of the path, (n, 2), m.
+        closed: Whether the path continues from the last point to the first; else the person stops
+            at the last point.
+        led: Whether the robot must follow this person.
+        speed: Walking speed, m/s.
+        pace: Relative amplitude of a slow variation of the speed.
+        speeds: Pairs [m along the path, m/s]: the speed from there on.
+        stops: Pairs [m along the path, s]: the person stands there for this time.
+        begins_at: Start, m along the path.
+        turn: Radius of the rounded corners, m.
+        radius: Radius of a leg, m.
+        apart: Lateral distance between the legs, m.
+    """
 
     way: Array = attrs.field(**points(2))
-    """Points, m, from one to the next."""
     closed: bool = attrs.field(default=False, **truth_value())
-    """Whether it goes on from the last point to the first, round after round; else it stays there."""
     led: bool = attrs.field(default=False, **truth_value())
-    """Whether it is the one whom the robot is to follow."""
     speed: float = attrs.field(default=1.2, **number(0.1, 3.0))
-    """m/s"""
     pace: float = attrs.field(default=0.0, **number(0.0, 0.9))
-    """Share by which its speed rises and falls, slowly."""
     speeds: Sequence[Sequence[float]] = ()
-    """[m along the way, m/s]: from there on it walks at that speed."""
     stops: Sequence[Sequence[float]] = ()
-    """[m along the way, s]: there it stands for so long."""
     begins_at: float = attrs.field(default=0.0, **number(0.0))
-    """m along the way, where it is at the start."""
     turn: float = attrs.field(default=0.8, **number(0.0, 20.0))
-    """Radius of its turns at the points, m."""
     radius: float = attrs.field(default=0.06, **number(0.03, 0.15))
-    """Of a leg, m."""
     apart: float = attrs.field(default=0.2, **number(0.1, 0.5))
-    """Of the legs from each other, sideways, m."""
 
     def __attrs_post_init__(self) -> None:
         for name, least in (("speeds", 0.1), ("stops", 0.0)):
@@ -317,12 +401,21 @@ class Person:
 
     @cached_property
     def path(self) -> Array:
-        """The way with its turns, (n, 2), m."""
-        return rounded(self.way, self.turn, self.closed)
+        """Path with rounded corners, (n, 2), m."""
+        return round_corners(self.way, self.turn, self.closed)
 
 
-def rounded(way: Array, radius: float, closed: bool) -> Array:
-    """`way` (n, 2) with arcs of about that radius, m, in place of its corners, at most half of each piece long."""
+def round_corners(way: Array, radius: float, closed: bool) -> Array:
+    """Round the corners of a polyline with parabolas.
+
+    Args:
+        way: Polyline, (n, 2), m.
+        radius: Approximate radius, m; a rounded corner uses at most half of each adjacent segment.
+        closed: Whether the last point is connected to the first.
+
+    Returns:
+        Rounded polyline, (m, 2), m.
+    """
     if radius == 0.0 or len(way) < 3:
         return way
     count = len(way)
@@ -333,14 +426,14 @@ def rounded(way: Array, radius: float, closed: bool) -> Array:
         room = 0.49 * min(np.hypot(*back), np.hypot(*ahead))
         back, ahead = back / np.hypot(*back), ahead / np.hypot(*ahead)
         half = 0.5 * np.arccos(np.clip(back @ ahead, -1.0, 1.0))
-        if half < 0.05 or half > 0.5 * np.pi - 1e-3:  # it turns back, or goes on as it came
+        if half < 0.05 or half > 0.5 * np.pi - 1e-3:  # a U-turn, or straight on
             found.append(here[None])
             continue
+        # Quadratic Bezier curve (a parabola) between points at distance r / tan(alpha / 2) from the
+        # corner: p(t) = corner + cut ((1 - t)^2 back + t^2 ahead).
         cut = min(radius / np.tan(half), room)
-        t = np.linspace(0.0, 1.0, _ARC)[:, None]
-        found.append(
-            here + cut * ((1.0 - t) ** 2 * back + t**2 * ahead)
-        )  # a parabola, from tangent to tangent
+        t = np.linspace(0.0, 1.0, _ARC_POINTS)[:, None]
+        found.append(here + cut * ((1.0 - t) ** 2 * back + t**2 * ahead))
     return np.concatenate(found if closed else [*found, way[-1:]])
 
 
@@ -357,11 +450,26 @@ _PARTS: Mapping[str, type] = {
 
 @attrs.frozen(eq=False, kw_only=True)
 class World:
-    """What is around the robot, and its laser. ValueError where a part can't be."""
+    """Everything around the robot, and its laser.
+
+    Raises:
+        ValueError: A part is out of its range, or there are too many parts.
+
+    Attributes:
+        name: Name of the world.
+        seed: Seed of the bumps and of the laser's errors.
+        laser: Laser on the robot.
+        walls: Walls.
+        boxes: Boxes.
+        trees: Groups of trees.
+        tables: Tables.
+        patches: Patches of grass or gravel.
+        hills: Hills.
+        persons: People; the one that the robot must follow (`led`) is the first.
+    """
 
     name: str = "world"
     seed: int = attrs.field(default=0, **whole_number())
-    """Of bumps and of the laser's faults."""
     laser: Laser = attrs.field(factory=Laser)
     walls: Sequence[Wall] = ()
     boxes: Sequence[Box] = ()
@@ -370,52 +478,75 @@ class World:
     patches: Sequence[Patch] = ()
     hills: Sequence[Hill] = ()
     persons: Sequence[Person] = ()
-    """The one who is led first."""
 
     def __attrs_post_init__(self) -> None:
-        self._refuse_more("parts, pieces of walls and legs of tables counted each", self.solids, MOST_SOLIDS)
-        self._refuse_more("persons", len(self.persons), MOST_PERSONS)
-        self._refuse_more("points of bumps", sum(patch.count for patch in self.patches), MOST_HEIGHTS)
+        self._check_limit(
+            "parts, pieces of walls and legs of tables counted each", self.solid_count, MAX_SOLIDS
+        )
+        self._check_limit("persons", len(self.persons), MAX_PERSONS)
+        self._check_limit(
+            "points of bumps", sum(patch.point_count for patch in self.patches), MAX_HEIGHT_POINTS
+        )
         led = [i for i, person in enumerate(self.persons) if person.led]
         if len(led) > 1 or led[1:] or (led and led[0] != 0):
-            raise ValueError(f"persons: found {led} led, counted from 0, expected the first or none")
+            raise ValueError(f"persons: found `led` at indices {led}, expected index 0 or none")
         if float(self.height(0.0, 0.0)) != 0.0:
             raise ValueError("hills: found one at the origin, expected level ground where the robot starts")
 
     @staticmethod
-    def _refuse_more(what: str, found: float, most: int) -> None:
+    def _check_limit(what: str, found: float, most: int) -> None:
+        """Refuse a count above its limit."""
         if found > most:
             raise ValueError(f"found {found:.0f} {what}, expected {most} at most")
 
     @property
-    def solids(self) -> int:
-        """Number of geoms of what stands on the ground, and hills."""
+    def solid_count(self) -> int:
+        """Number of geoms of obstacles and hills."""
         walls = sum(len(wall.points) - 1 for wall in self.walls)
         trees = sum(len(group.positions) for group in self.trees)
         return walls + len(self.boxes) + trees + 5 * len(self.tables) + len(self.hills)
 
     @classmethod
     def load(cls, source: str | Path) -> World:
-        """Of a YAML file, or the shipped world of that name. ValueError names file, field, value found and what was expected."""
-        path = FOLDER / f"{source}.yaml" if str(source) in SHIPPED else Path(source)
+        """Load a world from a YAML file.
+
+        Args:
+            source: Path of a file, or the name of a shipped world.
+
+        Returns:
+            The world.
+
+        Raises:
+            ValueError: The file cannot be read, or a field is wrong; the message names file, field,
+                value found and expectation.
+        """
+        path = WORLDS_FOLDER / f"{source}.yaml" if str(source) in SHIPPED_WORLDS else Path(source)
         try:
             document = read_yaml(path, "a YAML file of a world")
         except OSError as error:
-            shipped = ", ".join(SHIPPED)
+            shipped = ", ".join(SHIPPED_WORLDS)
             raise ValueError(
                 f"world {source}: {error.strerror}, expected a YAML file or one of {shipped}"
             ) from None
         try:
-            return _world(document, path.stem)
+            return _parse_world(document, path.stem)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """Height of the ground (m) at `x`, `y` (m, shapes that broadcast), the bumps of patches apart."""
+        """Compute the height of the ground without the bumps of patches.
+
+        Args:
+            x: Coordinates, m.
+            y: Coordinates, m; shapes of `x` and `y` broadcast.
+
+        Returns:
+            Height, m.
+        """
         place = np.stack(np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float)), axis=-1)
         if not self.hills:
             return np.zeros(place.shape[:-1])
-        centre, turn, half, steepness, top = self._hills
+        centre, turn, half, steepness, top = self._hill_arrays
         away = ((place[..., None, :] - centre)[..., None, :] @ turn)[
             ..., 0, :
         ]  # (..., hills, 2), along and across each
@@ -423,8 +554,8 @@ class World:
         return np.asarray(np.minimum(rise, top).max(-1).clip(0.0))
 
     @cached_property
-    def _hills(self) -> tuple[Array, ...]:
-        """Of all hills: centres, rotations, half sizes, steepnesses, heights."""
+    def _hill_arrays(self) -> tuple[Array, ...]:
+        """Centres, rotations, half sizes, slopes and heights of all hills."""
         return (
             np.array([hill.position for hill in self.hills]),
             np.array([_rotation(np.radians(hill.yaw)) for hill in self.hills]),
@@ -434,8 +565,12 @@ class World:
         )
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
-        """Add all that stands still to the robot's `spec`, as geoms of the world body that are named after their parts."""
-        self._add(
+        """Add all static parts to a model, as geoms of the world body named after the parts.
+
+        Args:
+            spec: Model that is extended.
+        """
+        self._add_geom(
             spec,
             GEOM_NAME,
             type=mujoco.mjtGeom.mjGEOM_PLANE,
@@ -448,7 +583,7 @@ class World:
                 for i, part in enumerate(getattr(self, kind)):
                     part.add_to(spec, f"{record.__name__.lower().removesuffix('s')}_{i}", self)
 
-    def _upright(
+    def _add_upright(
         self,
         spec: mujoco.MjSpec,
         name: str,
@@ -458,26 +593,37 @@ class World:
         yaw: float,
         rgba: Sequence[float],
     ) -> None:
-        """A box of that size, or a cylinder of twice that radius, from the ground up, and somewhat into it."""
+        """Add a box, or a cylinder of radius `size[0]` and height `size[2]`, on the ground.
+
+        It extends `_FOUNDATION_DEPTH_M` into the ground.
+        """
         along, across, up = np.asarray(size, float)
         ground = float(self.height(*position))
-        half = [along, 0.5 * (up + _DEEP), 0.0]
+        half = [along, 0.5 * (up + _FOUNDATION_DEPTH_M), 0.0]
         if kind == _BOX:
-            half = [0.5 * along, 0.5 * across, 0.5 * (up + _DEEP)]
-        middle = [*position, ground + 0.5 * (up - _DEEP)]
-        self._add(spec, name, type=kind, pos=middle, size=half, quat=_about_z(yaw), rgba=rgba)
+            half = [0.5 * along, 0.5 * across, 0.5 * (up + _FOUNDATION_DEPTH_M)]
+        middle = [*position, ground + 0.5 * (up - _FOUNDATION_DEPTH_M)]
+        self._add_geom(spec, name, type=kind, pos=middle, size=half, quat=_quaternion_about_z(yaw), rgba=rgba)
 
     @staticmethod
-    def _add(spec: mujoco.MjSpec, name: str, **geom: Any) -> None:
-        """A geom that the robot's collide with; they do with contype 1 alone."""
+    def _add_geom(spec: mujoco.MjSpec, name: str, **geom: Any) -> None:
+        """Add a geom that collides with the robot: its geoms collide with contype 1 only."""
         given = {key: value for key, value in geom.items() if value is not None}
         spec.worldbody.add_geom(
-            **{"name": name, "contype": 1, "conaffinity": 0, "group": SEEN, "solref": _SOLREF, **given}
+            **{
+                "name": name,
+                "contype": 1,
+                "conaffinity": 0,
+                "group": LASER_VISIBLE_GROUP,
+                "solref": _SOLREF,
+                **given,
+            }
         )
 
 
-def _world(document: object, name: str) -> World:
-    fields = dict(_mapping(document, "the file"))
+def _parse_world(document: object, name: str) -> World:
+    """Return the world of a YAML document."""
+    fields = dict(_require_mapping(document, "the file"))
     schema = fields.pop("schema", None)
     if schema != SCHEMA or isinstance(schema, bool):
         raise ValueError(f"schema: found {schema!r}, expected {SCHEMA}")
@@ -486,15 +632,15 @@ def _world(document: object, name: str) -> World:
             rows = fields[kind]
             if not isinstance(rows, list):
                 raise ValueError(f"{kind}: found {rows!r}, expected a list")
-            fields[kind] = tuple(_made(record, row, f"{kind}[{i}]") for i, row in enumerate(rows))
+            fields[kind] = tuple(_make_record(record, row, f"{kind}[{i}]") for i, row in enumerate(rows))
     if "laser" in fields:
-        fields["laser"] = _made(Laser, fields["laser"], "laser")
-    return _made(World, {"name": name, **fields}, "the file")
+        fields["laser"] = _make_record(Laser, fields["laser"], "laser")
+    return _make_record(World, {"name": name, **fields}, "the file")
 
 
-def _made(record: type, fields: object, where: str) -> Any:
-    """A record of a mapping; errors say where in the file it stands."""
-    given = _mapping(fields, where)
+def _make_record(record: type, fields: object, where: str) -> Any:
+    """Return a record from a mapping; errors name the place in the file."""
+    given = _require_mapping(fields, where)
     known = {field.name: field for field in attrs.fields(record)}
     for key in given:
         if key not in known:
@@ -504,21 +650,24 @@ def _made(record: type, fields: object, where: str) -> Any:
             raise ValueError(f"{where}: found no field {key!r}, expected one")
     try:
         return record(**given)
-    except TypeError as error:  # a word where a number should be
+    except TypeError as error:  # text instead of a number
         raise ValueError(f"{where}: {error}") from None
     except ValueError as error:
         raise ValueError(f"{where}: {error}" if record is not World else str(error)) from None
 
 
-def _mapping(value: object, where: str) -> Mapping[str, Any]:
+def _require_mapping(value: object, where: str) -> Mapping[str, Any]:
+    """Return the value if it is a mapping, else raise ValueError."""
     if not isinstance(value, Mapping):
         raise ValueError(f"{where}: found {value!r}, expected fields with their values")
     return value
 
 
 def _rotation(yaw: float) -> Array:
+    """Return the 2-D rotation matrix of an angle in rad."""
     return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
 
 
-def _about_z(yaw: float) -> list[float]:
+def _quaternion_about_z(yaw: float) -> list[float]:
+    """Return the quaternion (w, x, y, z) of a yaw angle in rad."""
     return [float(np.cos(0.5 * yaw)), 0.0, 0.0, float(np.sin(0.5 * yaw))]

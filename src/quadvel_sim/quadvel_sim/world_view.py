@@ -1,4 +1,4 @@
-"""What a world adds to a simulated robot's topics: its laser's scans, and where the persons truly are. Needs rclpy."""
+"""ROS topics of a world: laser scans, mounting of the laser, true positions of people."""
 
 from __future__ import annotations
 
@@ -17,9 +17,15 @@ from quadvel_sim.world import World
 
 
 class WorldView:
-    """Publishes scan, ground_truth/persons, and once where the laser is, in the name of a node."""
+    """Publishes scan, ground_truth/persons and the static transform of the laser for a node."""
 
     def __init__(self, node: Node, world: World) -> None:
+        """Create the publishers and publish the laser's mounting.
+
+        Args:
+            node: Node that publishes.
+            world: World with the laser.
+        """
         laser, scanner = world.laser, world.laser.scanner
         self._scan = node.create_publisher(LaserScan, "scan", 10)
         self._persons = node.create_publisher(PoseArray, "ground_truth/persons", 10)
@@ -39,7 +45,13 @@ class WorldView:
         self._message.header.frame_id = LASER
 
     def publish(self, stamp: Any, simulator: Simulator, view: bool) -> None:
-        """The scan of this instant if one is due, and the persons where `view` says that people are to see them."""
+        """Publish the scan if one is due, and the people if display topics are due.
+
+        Args:
+            stamp: Time of the sample, builtin_interfaces/Time.
+            simulator: Simulation of the world.
+            view: Whether topics for display are due.
+        """
         scan = simulator.scan()
         if scan is not None:
             self._message.header.stamp = stamp
@@ -53,6 +65,7 @@ class WorldView:
 
 
 def _pose(x: float, y: float, yaw: float) -> Any:
+    """Return a geometry_msgs/Pose at x, y (m) with a heading (rad)."""
     pose = Pose()
     pose.position.x, pose.position.y = float(x), float(y)
     pose.orientation.w, pose.orientation.z = float(np.cos(0.5 * yaw)), float(np.sin(0.5 * yaw))

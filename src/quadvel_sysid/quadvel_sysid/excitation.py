@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from quadvel_description import robot
-from quadvel_description.command_range import held
+from quadvel_description.command_range import clip_to_command_range
 from quadvel_description.kinematics import HIPS, foot_jacobians, inverse_kinematics
 
 Array = NDArray[np.float64]
@@ -60,7 +60,7 @@ class Excitation(ABC):
         Returns:
             (n, 12) targets, rad, one row every `PERIOD_S`.
         """
-        return limit_speed(held(self._joint_targets(self._times())))
+        return limit_speed(clip_to_command_range(self._joint_targets(self._times())))
 
     def support_torque(self) -> Array:
         """Compute the feed-forward torque that carries the robot on its feet.

@@ -1,6 +1,6 @@
-"""The part of rclpy that our nodes use, over Cyclone DDS; imported as `rclpy` after `quadvel_dds.install()`.
+"""Subset of rclpy over Cyclone DDS; imported as `rclpy` after `quadvel_dds.install()`.
 
-Names, parameters and defaults are those of rclpy 7.1 (Jazzy). What is not here raises UnsupportedError.
+Names, parameters and defaults are those of rclpy 7.1 (Jazzy). Missing parts raise UnsupportedError.
 """
 
 from __future__ import annotations
@@ -30,24 +30,48 @@ def init(
     *, args: list[str] | None = None, context: Context | None = None, domain_id: int | None = None,
     signal_handler_options: SignalHandlerOptions | None = None,
 ) -> None:  # fmt: skip
-    """Start communication: read the arguments (sys.argv if None). No signals are taken over: see `signals`."""
+    """Start communication. Signal handlers are not changed, see `signals`.
+
+    Args:
+        args: Command line; None: `sys.argv`.
+        context: Not supported.
+        domain_id: Number of the domain; None: ROS_DOMAIN_ID.
+        signal_handler_options: Ignored.
+    """
     refuse_options("rclpy.init", context=context)
     get_default_context().init(args, domain_id=domain_id)
 
 
 def shutdown(*, context: Context | None = None, uninstall_handlers: bool | None = None) -> None:
-    """Stop communication. Raises RuntimeError if it does not run."""
+    """Stop communication. RuntimeError propagates if it does not run.
+
+    Args:
+        context: Not supported.
+        uninstall_handlers: Not supported.
+    """
     refuse_options("rclpy.shutdown", context=context, uninstall_handlers=uninstall_handlers)
     get_default_context(shutting_down=True).shutdown()
 
 
 def try_shutdown(*, context: Context | None = None) -> None:
-    """Stop communication if it runs."""
+    """Stop communication if it runs.
+
+    Args:
+        context: Not supported.
+    """
     refuse_options("rclpy.try_shutdown", context=context)
     get_default_context(shutting_down=True).try_shutdown()
 
 
 def ok(*, context: Context | None = None) -> bool:
+    """Return whether communication runs.
+
+    Args:
+        context: Not supported.
+
+    Returns:
+        True between `init` and `shutdown`.
+    """
     refuse_options("rclpy.ok", context=context)
     return get_default_context().ok()
 
@@ -58,7 +82,7 @@ _global_executor: Executor | None = None
 
 @contextmanager
 def _added(node: Node, executor: Any) -> Iterator[Executor]:
-    """The executor given, or one that all calls share as long as the context lives, with the node in it."""
+    """Add the node to the given executor, or to the shared one of the context, for a while."""
     global _global_executor
     if _global_executor is None or _global_executor.context is not get_default_context():
         _global_executor = SingleThreadedExecutor()
@@ -72,13 +96,24 @@ def _added(node: Node, executor: Any) -> Iterator[Executor]:
 
 
 def spin(node: Node, executor: Any = None) -> None:
-    """Run the callbacks of a node until the context is shut down."""
+    """Run the callbacks of a node until the context is shut down.
+
+    Args:
+        node: The node.
+        executor: Executor; None: the shared one.
+    """
     with _added(node, executor) as serving:
         serving.spin()
 
 
 def spin_once(node: Node, *, executor: Any = None, timeout_sec: float | None = None) -> None:
-    """Run one callback; wait for it for `timeout_sec` (None or negative: for ever)."""
+    """Run one callback.
+
+    Args:
+        node: The node.
+        executor: Executor; None: the shared one.
+        timeout_sec: Longest wait for a callback, s; None or negative: unlimited.
+    """
     with _added(node, executor) as serving:
         serving.spin_once(timeout_sec)
 
@@ -86,6 +121,13 @@ def spin_once(node: Node, *, executor: Any = None, timeout_sec: float | None = N
 def spin_until_future_complete(
     node: Node, future: Future, executor: Any = None, timeout_sec: float | None = None
 ) -> None:
-    """Run callbacks until a future is done, the time is up, or the context is shut down."""
+    """Run callbacks until a future is done, the timeout, or a shutdown of the context.
+
+    Args:
+        node: The node.
+        future: The future.
+        executor: Executor; None: the shared one.
+        timeout_sec: Timeout, s; None or negative: unlimited.
+    """
     with _added(node, executor) as serving:
         serving.spin_until_future_complete(future, timeout_sec)

@@ -1,4 +1,4 @@
-"""The parameters of a node: declaration, overrides, and what operators read. A part of `Node`."""
+"""Parameters of a node: declaration, overrides, and services. A part of `Node`."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from .qos import qos_profile_parameters
 
 
 class ParameterMixin(Partial):
-    """Keeps `_parameters` and `_descriptors` by name. Parameters are fixed once they are declared.
+    """Parameters of a node; they are constant once they are declared.
 
-    `_parameter_overrides` holds what the command line and parameter files give this node, declared or not.
+    `_parameters` and `_descriptors` hold the declared ones by name. `_parameter_overrides` holds
+    the values from command line and parameter files, declared or not.
     """
 
     def _init_parameters(self, overrides: dict[str, Parameter]) -> None:
+        """Start without declared parameters."""
         self._parameters: dict[str, Parameter] = {}
         self._descriptors: dict[str, Any] = {}
         self._parameter_overrides = overrides
@@ -28,9 +30,19 @@ class ParameterMixin(Partial):
     def declare_parameter(
         self, name: str, value: Any = None, descriptor: Any = None, ignore_override: bool = False
     ) -> Parameter:
-        """Declare a parameter with its default, or with its type alone if it must be overridden.
+        """Declare a parameter.
 
-        Raises ParameterException if it is there already or is overridden by a value of another type.
+        Args:
+            name: Name of the parameter.
+            value: Default, or a `Parameter.Type` if an override is required.
+            descriptor: Description, a rcl_interfaces/ParameterDescriptor.
+            ignore_override: Whether an override is ignored.
+
+        Returns:
+            The parameter.
+
+        Raises:
+            ParameterException: It is declared already, or the override has another type.
         """
         if name in self._parameters:
             raise ParameterException(f"Parameter(s) already declared: {name}")
@@ -58,9 +70,29 @@ class ParameterMixin(Partial):
         return self._parameters[name]
 
     def has_parameter(self, name: str) -> bool:
+        """Return whether a parameter is declared.
+
+        Args:
+            name: Name of the parameter.
+
+        Returns:
+            Whether it is declared.
+        """
         return name in self._parameters
 
     def get_parameter(self, name: str) -> Parameter:
+        """Return a declared parameter.
+
+        Args:
+            name: Name of the parameter.
+
+        Returns:
+            The parameter.
+
+        Raises:
+            ParameterNotDeclaredException: It is not declared.
+            ParameterException: It has no value.
+        """
         if name not in self._parameters:
             raise ParameterNotDeclaredException(name)
         if self._parameters[name].type_ == Parameter.Type.NOT_SET:
@@ -69,6 +101,7 @@ class ParameterMixin(Partial):
 
     # The services through which `ros2 param` and operator tools read them.
     def _start_parameter_services(self) -> None:
+        """Create the parameter services."""
         for kind, name, answer in (
             (srv.DescribeParameters, "describe_parameters", self._on_describe),
             (srv.GetParameters, "get_parameters", self._on_get),
@@ -93,11 +126,11 @@ class ParameterMixin(Partial):
         return response
 
     def _all_or_none(self, names: list[str]) -> list[str]:
-        """The names, none of them if one is not declared: so answers ROS 2."""
+        """Return the names if all are declared, else none, as ROS 2 answers."""
         return names if all(name in self._parameters for name in names) else []
 
     def _on_list(self, request: Any, response: Any) -> Any:
-        """Names below the prefixes (none: all), at most `depth` parts below (0: any), and their prefixes."""
+        """List names below the prefixes (none: all), at most `depth` parts below (0: any)."""
         response.result = result = ListParametersResult()
         for name in self._parameters:
             below = [name[len(p) + 1 :] for p in request.prefixes if name.startswith(f"{p}.")]
@@ -117,5 +150,6 @@ class ParameterMixin(Partial):
         return response
 
     def _refusal(self, parameters: list[Any]) -> Any:
+        """Return the result of a refused change."""
         names = ", ".join(parameter.name for parameter in parameters)
         return SetParametersResult(successful=False, reason=f"Trying to set a read-only parameter: {names}.")

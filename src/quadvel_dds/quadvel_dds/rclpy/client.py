@@ -1,4 +1,4 @@
-"""Clients of services."""
+"""Service clients."""
 
 from __future__ import annotations
 
@@ -14,10 +14,19 @@ from quadvel_dds.errors import Partial
 from .logging import get_logger
 from .task import Future
 
-WAIT_STEP = 0.01  # s, between two looks for a service
+SERVICE_POLL_PERIOD_S = 0.01
 
 
 class Client(Partial):
+    """Client of a service, see rclpy's Client.
+
+    Attributes:
+        context: Context of the node.
+        srv_type: Class of the service.
+        service_name: Full name of the service.
+        qos_profile: QoS profile.
+    """
+
     def __init__(
         self, context: Any, client_impl: wire.CallEndpoint, srv_type: Any, srv_name: str, qos_profile: Any,
         callback_group: Any,
@@ -33,7 +42,17 @@ class Client(Partial):
         self._lock = Lock()
 
     def call_async(self, request: Any) -> Future:
-        """Send a request; the future that is returned gets the answer while the node spins."""
+        """Send a request.
+
+        Args:
+            request: The request.
+
+        Returns:
+            Future of the response; it completes while the node spins.
+
+        Raises:
+            TypeError: The request has another type.
+        """
         if not isinstance(request, self.srv_type.Request):
             raise TypeError(f"Expected {self.srv_type.Request}, got {type(request)}")
         future = Future()
@@ -45,24 +64,44 @@ class Client(Partial):
         return future
 
     def remove_pending_request(self, future: Future) -> None:
+        """Ignore the response of a request.
+
+        Args:
+            future: Future of the request.
+        """
         with self._lock:
             self._pending = {number: other for number, other in self._pending.items() if other is not future}
 
     def service_is_ready(self) -> bool:
+        """Return whether a service is connected.
+
+        Returns:
+            Whether requests reach a service.
+        """
         return self._endpoint.is_matched()
 
     def wait_for_service(self, timeout_sec: float | None = None) -> bool:
+        """Wait until a service is connected.
+
+        Args:
+            timeout_sec: Timeout, s; None or negative: unlimited.
+
+        Returns:
+            Whether a service is connected.
+        """
         deadline = None if timeout_sec is None or timeout_sec < 0 else time.monotonic() + timeout_sec
         while self.context.ok() and not self.service_is_ready():
             if deadline is not None and time.monotonic() >= deadline:
                 return False
-            time.sleep(WAIT_STEP)
+            time.sleep(SERVICE_POLL_PERIOD_S)
         return self.service_is_ready()
 
     def destroy(self) -> None:
+        """Delete the endpoint; `Node.destroy_client` calls this."""
         self._endpoint.close()
 
     def _take(self) -> Callable[[], Any] | None:
+        """Return a call that completes the future of a received response, or None."""
         sample = self._reader.take()
         if sample is None:
             return None
@@ -74,5 +113,5 @@ class Client(Partial):
         with self._lock:
             future = self._pending.get(number)
         if client_id != self._endpoint.client_id or future is None:
-            return None  # the answer to another client, or to a call that was given up
+            return None  # the response to another client, or to a removed request
         return lambda: future.set_result(response)

@@ -1,4 +1,4 @@
-"""Clocks: system, steady, and ROS time, which a simulator may drive through /clock."""
+"""Clocks: system time, steady time, and ROS time, which /clock may drive."""
 
 from __future__ import annotations
 
@@ -11,13 +11,27 @@ from .time import Time
 
 
 class Clock(Partial):
-    """ROS time is system time until it is driven by /clock (parameter use_sim_time of a node)."""
+    """Clock of a type; ROS time is system time unless /clock drives it (parameter use_sim_time).
+
+    Attributes:
+        clock_type: Type of the clock.
+    """
 
     def __init__(self, *, clock_type: ClockType = ClockType.SYSTEM_TIME) -> None:
+        """Create a clock.
+
+        Args:
+            clock_type: Type of the clock.
+        """
         self.clock_type = ClockType(clock_type)
-        self._simulated_ns: int | None = None  # what /clock said last, where it counts
+        self._simulated_ns: int | None = None  # latest value of /clock, if it drives this clock
 
     def now(self) -> Time:
+        """Return the present time.
+
+        Returns:
+            Time of this clock.
+        """
         return Time(nanoseconds=self._now_ns(), clock_type=self.clock_type)
 
     def _now_ns(self) -> int:

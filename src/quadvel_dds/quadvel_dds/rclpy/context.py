@@ -1,4 +1,4 @@
-"""The state of ROS communication in this process: arguments, domain, and whether it still runs."""
+"""State of ROS communication in this process: arguments, domain, and whether it runs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,14 @@ _default_lock = Lock()
 
 
 class Context(Partial):
+    """Communication context, see rclpy's Context; there is one at a time.
+
+    Attributes:
+        arguments: ROS arguments of the command line.
+    """
+
     def __init__(self) -> None:
+        """Create a context that does not run."""
         self._running = False
         self._participant: wire.Participant | None = None
         self._participant_lock = Lock()
@@ -33,7 +40,16 @@ class Context(Partial):
         self.arguments = arguments.RosArguments()
 
     def init(self, args: Sequence[str] | None, domain_id: int | None = None) -> None:
-        """Read the arguments (sys.argv if None) and join the domain given, or that of ROS_DOMAIN_ID."""
+        """Parse the arguments and start communication; the domain is joined at its first use.
+
+        Args:
+            args: Command line; None: `sys.argv`.
+            domain_id: Number of the domain; None: ROS_DOMAIN_ID.
+
+        Raises:
+            RuntimeError: It runs already.
+            ValueError: ROS_DOMAIN_ID is invalid, or security is enabled.
+        """
         if self._running:
             raise RuntimeError("Context.init() must only be called once")
         if domain_id is None:
@@ -52,11 +68,16 @@ class Context(Partial):
         _contexts.add(self)
 
     def ok(self) -> bool:
+        """Return whether communication runs.
+
+        Returns:
+            True between `init` and `shutdown`.
+        """
         return self._running
 
     @property
     def participant(self) -> wire.Participant:
-        """The process's place on the domain, taken when it is first needed."""
+        """Participant of this process; it joins the domain at its first use."""
         with self._participant_lock:
             if self._participant is None:
                 self._participant = wire.Participant(self._domain_id)
@@ -64,17 +85,22 @@ class Context(Partial):
             return self._participant
 
     def _announce_nodes(self) -> None:
+        """Announce the nodes of this process."""
         if self._announcer is not None and self._running:
             self._announcer.announce(self._nodes)
 
     def shutdown(self) -> None:
-        """Stop communication. Raises RuntimeError if that was done before."""
+        """Stop communication.
+
+        Raises:
+            RuntimeError: It does not run.
+        """
         if not self._running:
             raise RuntimeError("Context must be initialized before it can be shutdown")
         self.try_shutdown()
 
     def try_shutdown(self) -> None:
-        """Stop communication if it runs. May be called by a signal handler: it only tells others to end."""
+        """Stop communication if it runs; a signal handler may call this."""
         if self._running:
             self._running = False
             for executor in list(self._wakers):
@@ -91,7 +117,14 @@ class Context(Partial):
 
 
 def get_default_context(*, shutting_down: bool = False) -> Context:
-    """The context of this process; a new one after it was shut down."""
+    """Return the context of this process; after its shutdown a new one.
+
+    Args:
+        shutting_down: Whether the caller shuts it down, so that the next call creates a new one.
+
+    Returns:
+        The context.
+    """
     global _default_context
     with _default_lock:
         context = _default_context = _default_context or Context()
@@ -102,6 +135,7 @@ def get_default_context(*, shutting_down: bool = False) -> Context:
 
 @atexit.register
 def _leave_all() -> None:
+    """Leave the domain when the process exits."""
     for context in list(_contexts):
         context.try_shutdown()
         context._leave(unless_used=False)

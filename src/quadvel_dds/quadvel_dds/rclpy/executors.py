@@ -1,7 +1,8 @@
-"""The executor: it waits for data and deadlines, and runs callbacks one after the other.
+"""Executor: waits for data and timers, and runs callbacks one after the other.
 
-The wait is one DDS wait set with the next timer deadline as its time-out: nothing is polled. Ready timers
-come before data, and each ready entity gets one callback before any gets a second, as in rclpy.
+The wait is one DDS wait set whose timeout is the next timer deadline; nothing is polled. As in
+rclpy, ready timers come before data, and each ready entity gets one callback before any gets a
+second.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from .timer import Timer
 
 __getattr__ = module_getattr(__name__)
 
-FOREVER = 2**63 - 1  # ns
-LONGEST_WAIT = 200_000_000  # ns: Python runs its handlers of signals only between two waits
+NEVER_NS = 2**63 - 1
+MAX_WAIT_NS = 200_000_000
+"""Longest single wait: Python runs signal handlers only between two waits."""
 
 
 class ExternalShutdownException(Exception):
@@ -31,7 +33,18 @@ class ExternalShutdownException(Exception):
 
 
 class Executor(Partial):
+    """Executor with one thread, see rclpy's Executor.
+
+    Attributes:
+        context: Context of the process.
+    """
+
     def __init__(self, *, context: Any = None) -> None:
+        """Create an executor without nodes.
+
+        Args:
+            context: Not supported.
+        """
         refuse_options("Executor", context=context)
         self.context = get_default_context()
         self._nodes: list[Any] = []
@@ -47,6 +60,14 @@ class Executor(Partial):
         self.context._wakers.add(self)
 
     def add_node(self, node: Any) -> bool:
+        """Add a node; it leaves its former executor.
+
+        Args:
+            node: The node.
+
+        Returns:
+            Whether the node was new here.
+        """
         with self._lock:
             if node in self._nodes:
                 return False
@@ -58,13 +79,30 @@ class Executor(Partial):
         return True
 
     def remove_node(self, node: Any) -> None:
+        """Remove a node.
+
+        Args:
+            node: The node.
+        """
         with self._lock:
             if node in self._nodes:
                 self._nodes.remove(node)
         self.wake()
 
     def create_task(self, callback: Callable[..., Any], *args: Any, **kwargs: Any) -> Future:
-        """Have the thread that spins call a function; the future that is returned gets its result."""
+        """Run a function in the spinning thread.
+
+        Args:
+            callback: The function.
+            *args: Its arguments.
+            **kwargs: Its keyword arguments.
+
+        Returns:
+            Future of its result.
+
+        Raises:
+            UnsupportedError: It is a coroutine function.
+        """
         if iscoroutinefunction(callback):
             raise UnsupportedError("a coroutine as a callback")
         future = Future()
@@ -73,14 +111,21 @@ class Executor(Partial):
         return future
 
     def wake(self) -> None:
-        """End the current wait, because something changed."""
+        """End the present wait after a change; may be called from any thread."""
         with self._lock:
             self._has_changed = True
             if self._waitset is not None:
                 self._waitset.wake()
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Stop; a spin that runs ends."""
+        """Stop the executor; a running `spin` returns.
+
+        Args:
+            timeout_sec: Ignored.
+
+        Returns:
+            True.
+        """
         self.wake()
         with self._lock:
             self._is_shutdown = True
@@ -91,14 +136,25 @@ class Executor(Partial):
         return True
 
     def spin(self) -> None:
+        """Run callbacks until a shutdown."""
         while self.context.ok() and not self._is_shutdown:
             self.spin_once()
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Run one callback; wait for it for `timeout_sec` (None or negative: for ever)."""
+        """Run one callback.
+
+        Args:
+            timeout_sec: Longest wait for a callback, s; None or negative: unlimited.
+        """
         self._spin_once(_deadline(timeout_sec), lambda: False)
 
     def spin_until_future_complete(self, future: Future, timeout_sec: float | None = None) -> None:
+        """Run callbacks until a future is done, the timeout, or a shutdown.
+
+        Args:
+            future: The future.
+            timeout_sec: Timeout, s; None or negative: unlimited.
+        """
         future.add_done_callback(lambda _: self.wake())
         deadline = _deadline(timeout_sec)
         while self.context.ok() and not future.done() and not self._is_shutdown:
@@ -107,7 +163,7 @@ class Executor(Partial):
                 return
 
     def _spin_once(self, deadline_ns: int, until: Callable[[], bool]) -> None:
-        """Run one callback, if one comes before the deadline, a shutdown, and the moment when `until` holds.
+        """Run one callback unless the deadline, a shutdown or the condition `until` comes first.
 
         Raises ExternalShutdownException if the context is shut down.
         """
@@ -128,7 +184,7 @@ class Executor(Partial):
         return None
 
     def _wait(self, deadline_ns: int) -> None:
-        """Wait until something is ready, the deadline, or a wake-up; what is ready goes into `_ready`."""
+        """Wait for a ready entity, the deadline or `wake`; ready entities go into `_ready`."""
         with self._lock:
             if self._is_shutdown:
                 return
@@ -142,21 +198,21 @@ class Executor(Partial):
                 self._waiting = [entity for entity in entities if not isinstance(entity, Timer)]
                 waitset.update({entity._reader for entity in self._waiting})
             timers, waiting = self._timers, self._waiting
-        if not self.context.ok():  # a signal came while there was no wait set yet that it could have woken
+        if not self.context.ok():  # a signal may have come before the wait set existed
             return
         wakes = (timer._wake_ns() for timer in timers)
         wake_ns = min([deadline_ns, *(wake for wake in wakes if wake is not None)])
-        waitset.wait(min(max(0, wake_ns - time.monotonic_ns()), LONGEST_WAIT))
+        waitset.wait(min(max(0, wake_ns - time.monotonic_ns()), MAX_WAIT_NS))
         self._ready.extend(timer for timer in timers if timer.is_ready())
         self._ready.extend(entity for entity in waiting if entity._reader.has_data())
 
 
 class SingleThreadedExecutor(Executor):
-    """Runs callbacks in the thread that spins, as each executor here does."""
+    """Executor that runs callbacks in the spinning thread, as every executor here does."""
 
 
 def _deadline(timeout_sec: float | None) -> int:
-    """Monotonic time in ns at which a wait ends."""
+    """Return the monotonic time in ns at which a wait ends."""
     if timeout_sec is None or timeout_sec < 0:
-        return FOREVER
+        return NEVER_NS
     return time.monotonic_ns() + int(timeout_sec * 1e9)

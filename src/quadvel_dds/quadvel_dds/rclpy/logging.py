@@ -15,6 +15,8 @@ __getattr__ = module_getattr(__name__)
 
 
 class LoggingSeverity(IntEnum):
+    """Severities of log messages, as in rclpy."""
+
     UNSET = 0
     DEBUG = 10
     INFO = 20
@@ -25,18 +27,35 @@ class LoggingSeverity(IntEnum):
 
 levels: dict[str, int] = {"": LoggingSeverity.INFO}  # by logger name; "" is the default
 sinks: dict[str, Callable[[int, str, str, int, Any], None]] = {}
-"""Who else is told, by logger name: (level, name, message, time in ns, frame of the caller)."""
+"""Further receivers by logger name: (level, name, message, time in ns, frame of the caller)."""
 
 
 class RcutilsLogger(Partial):
-    """Logger with names in a hierarchy ("node.part"); keyword options of each method are those of `_log`."""
+    """Logger with a hierarchical name ("node.part"), see rclpy's RcutilsLogger.
+
+    The methods `debug`, `info`, `warning`, `error` and `fatal` take a message and the options of
+    `_log`.
+
+    Attributes:
+        name: Name of the logger.
+    """
 
     def __init__(self, name: str = "") -> None:
+        """Create a logger.
+
+        Args:
+            name: Name of the logger.
+        """
         self.name = name
         self._places: dict[tuple[Any, int], float] = {}  # when each spoke last, where that counts
         self._severities: dict[tuple[Any, int], int] = {}
 
     def get_effective_level(self) -> int:
+        """Return the level of the logger or of its nearest ancestor with one.
+
+        Returns:
+            Lowest severity that is logged.
+        """
         name = self.name
         while name and not levels.get(name):
             name = name.rpartition(".")[0]
@@ -45,7 +64,10 @@ class RcutilsLogger(Partial):
     def _log(
         self, severity: LoggingSeverity, message: str, *, once: bool = False, throttle_duration_sec: float = 0
     ) -> bool:
-        """Whether it was said. once, throttle_duration_sec: how often, for each place in the program."""
+        """Log a message and return whether it was logged.
+
+        `once` and `throttle_duration_sec` (s) limit the messages of each place in the program.
+        """
         if severity < self.get_effective_level():
             return False
         frame = sys._getframe(1)
@@ -72,13 +94,31 @@ class RcutilsLogger(Partial):
 
 
 def get_logger(name: str) -> RcutilsLogger:
+    """Create a logger.
+
+    Args:
+        name: Name of the logger.
+
+    Returns:
+        The logger.
+
+    Raises:
+        ValueError: The name is empty.
+    """
     if not name:
         raise ValueError("Logger name must not be empty.")
     return RcutilsLogger(name)
 
 
 def set_levels(texts: dict[str, str]) -> None:
-    """Set levels given by name, by logger name ("" is the default). Raises ValueError on an unknown one."""
+    """Set log levels.
+
+    Args:
+        texts: Level by logger name; the name "" is the default.
+
+    Raises:
+        ValueError: A level is unknown.
+    """
     for name, text in texts.items():
         if text.upper() not in LoggingSeverity.__members__:
             expected = ", ".join(member.lower() for member in LoggingSeverity.__members__)

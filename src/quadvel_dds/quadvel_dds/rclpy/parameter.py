@@ -1,4 +1,4 @@
-"""Parameters of a node: a name, a type, a value."""
+"""Parameters of a node: name, type and value."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ _ELEMENTS = {"BOOL": bool, "INTEGER": int, "DOUBLE": float, "STRING": str}
 
 
 class ParameterKind(Enum):
+    """Type of a parameter; rclpy's `Parameter.Type`."""
+
     NOT_SET = ParameterType.PARAMETER_NOT_SET
     BOOL = ParameterType.PARAMETER_BOOL
     INTEGER = ParameterType.PARAMETER_INTEGER
@@ -28,14 +30,31 @@ class ParameterKind(Enum):
 
     @classmethod
     def from_parameter_value(cls, parameter_value: Any) -> ParameterKind:
-        """Type of a Python value. Raises TypeError if no parameter can hold it."""
+        """Find the type of a Python value.
+
+        Args:
+            parameter_value: The value.
+
+        Returns:
+            Type of a parameter that holds it.
+
+        Raises:
+            TypeError: No parameter can hold it.
+        """
         for member in cls:
             if member.check(parameter_value):
                 return member
         raise TypeError(f"The given value is not of a type that a parameter can hold: {parameter_value!r}")
 
     def check(self, parameter_value: Any) -> bool:
-        """Whether a value is of this type. An empty list is one of every kind of list."""
+        """Return whether a value has this type; an empty list has every list type.
+
+        Args:
+            parameter_value: The value.
+
+        Returns:
+            Whether it has this type.
+        """
         if self == ParameterKind.NOT_SET:
             return parameter_value is None
         if self.name in _ELEMENTS:
@@ -47,16 +66,38 @@ class ParameterKind(Enum):
 
 
 class Parameter(Partial):
+    """Parameter, see rclpy's Parameter.
+
+    Attributes:
+        name: Name of the parameter.
+        value: Its value.
+        type_: Its type.
+    """
+
     Type = ParameterKind
 
     def __init__(self, name: str, type_: ParameterKind | None = None, value: Any = None) -> None:
+        """Create a parameter.
+
+        Args:
+            name: Name of the parameter.
+            type_: Its type; None: that of the value.
+            value: Its value.
+
+        Raises:
+            ValueError: Type and value do not match.
+        """
         self.name, self.value = name, value
         self.type_ = ParameterKind.from_parameter_value(value) if type_ is None else type_
         if not self.type_.check(value):
             raise ValueError(f"Type '{type_}' and value '{value}' do not agree")
 
     def get_parameter_value(self) -> Any:
-        """The value as message rcl_interfaces/ParameterValue."""
+        """Convert the value to a message.
+
+        Returns:
+            A rcl_interfaces/ParameterValue.
+        """
         message = ParameterValue(type=self.type_.value)
         if self.type_ != ParameterKind.NOT_SET:
             setattr(message, f"{self.type_.name.lower()}_value", self.value)

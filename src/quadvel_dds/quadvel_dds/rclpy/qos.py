@@ -13,6 +13,8 @@ __getattr__ = module_getattr(__name__)
 
 
 class HistoryPolicy(IntEnum):
+    """History policies, as in rclpy."""
+
     SYSTEM_DEFAULT = 0
     KEEP_LAST = 1
     KEEP_ALL = 2
@@ -20,6 +22,8 @@ class HistoryPolicy(IntEnum):
 
 
 class ReliabilityPolicy(IntEnum):
+    """Reliability policies, as in rclpy."""
+
     SYSTEM_DEFAULT = 0
     RELIABLE = 1
     BEST_EFFORT = 2
@@ -28,6 +32,8 @@ class ReliabilityPolicy(IntEnum):
 
 
 class DurabilityPolicy(IntEnum):
+    """Durability policies, as in rclpy."""
+
     SYSTEM_DEFAULT = 0
     TRANSIENT_LOCAL = 1
     VOLATILE = 2
@@ -47,13 +53,29 @@ _UNSUPPORTED = ("deadline", "liveliness", "liveliness_lease_duration", "avoid_ro
 
 
 class InvalidQoSProfileException(Exception):
-    """A profile that lacks what it must say."""
+    """A profile lacks a required policy."""
 
 
 class QoSProfile(Partial):
-    """What a publisher offers and a subscription asks for. `history` or `depth` must be given."""
+    """Quality of service of an endpoint, see rclpy's QoSProfile; `history` or `depth` is required.
+
+    Attributes:
+        history: Which samples are kept.
+        depth: Number of kept samples.
+        reliability: Whether samples are sent again.
+        durability: Whether late subscriptions receive earlier samples.
+        lifespan: Age beyond which samples are dropped; zero: unlimited.
+    """
 
     def __init__(self, **kwargs: Any) -> None:
+        """Create a profile.
+
+        Args:
+            **kwargs: Policies by name.
+
+        Raises:
+            InvalidQoSProfileException: A depth is required.
+        """
         history = kwargs.setdefault("history", HistoryPolicy.KEEP_LAST)
         if history == HistoryPolicy.KEEP_LAST and "depth" not in kwargs:
             raise InvalidQoSProfileException("Invalid QoSProfile: a depth is required")

@@ -1,4 +1,4 @@
-"""Services: answers to requests."""
+"""Services."""
 
 from __future__ import annotations
 
@@ -14,11 +14,21 @@ from .logging import get_logger
 from .time import ClockType
 from .timer import Timer
 
-PATIENCE = 0.5  # s, in which the reader of a client that asked must be found
-LOOK = 5_000_000  # ns, between two looks for it
+CLIENT_TIMEOUT_S = 0.5
+"""Time in which the reader of a requesting client must be discovered."""
+RETRY_PERIOD_NS = 5_000_000
 
 
 class Service(Partial):
+    """Service, see rclpy's Service.
+
+    Attributes:
+        srv_type: Class of the service.
+        service_name: Full name of the service.
+        callback: Called with request and response.
+        qos_profile: QoS profile.
+    """
+
     def __init__(
         self, service_impl: wire.CallEndpoint, srv_type: Any, srv_name: str,
         callback: Callable[[Any, Any], Any], callback_group: Any, qos_profile: Any,
@@ -29,21 +39,30 @@ class Service(Partial):
         self.service_name = srv_name
         self.callback = callback
         self.qos_profile = qos_profile
-        # Answers whose client was not found yet, and until when it is looked for; the timer runs while there are any.
+        # Responses whose client is not connected yet, with their deadlines; a timer retries.
         self._waiting: list[tuple[float, Any, Any]] = []
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._look = Timer(self._try_again, None, LOOK, steady, autostart=False)
+        self._retry_timer = Timer(self._retry_responses, None, RETRY_PERIOD_NS, steady, autostart=False)
 
     def send_response(self, response: Any, header: Any) -> None:
-        """Send the answer to the request that came with `header`; later, if the client is not found yet."""
+        """Send a response; if the client is not connected yet, retry for `CLIENT_TIMEOUT_S`.
+
+        Args:
+            response: The response.
+            header: Request id and client, as received.
+
+        Raises:
+            TypeError: The response has another type.
+        """
         if not isinstance(response, self.srv_type.Response):
             where, expected = f"service {self.service_name}", self.srv_type.Response.TYPENAME
             raise TypeError(f"{where}: the callback returned {response!r}, expected {expected}")
         if not self._endpoint.answer(response, *header):
-            self._waiting.append((time.monotonic() + PATIENCE, response, header))
-            self._look.reset()
+            self._waiting.append((time.monotonic() + CLIENT_TIMEOUT_S, response, header))
+            self._retry_timer.reset()
 
-    def _try_again(self) -> None:
+    def _retry_responses(self) -> None:
+        """Retry to send waiting responses."""
         waiting, self._waiting = self._waiting, []
         for until, response, header in waiting:
             if self._endpoint.answer(response, *header):
@@ -54,21 +73,23 @@ class Service(Partial):
                 text = f"service {self.service_name}: a client that asked does not listen"
                 get_logger("rclpy").warning(text)
         if not self._waiting:
-            self._look.cancel()
+            self._retry_timer.cancel()
 
     def destroy(self) -> None:
+        """Delete the endpoint; `Node.destroy_service` calls this."""
         self._waiting.clear()
-        self._look.destroy()
+        self._retry_timer.destroy()
         self._endpoint.close()
 
     def _take(self) -> Callable[[], Any] | None:
+        """Return a call that answers a received request, or None."""
         sample = self._reader.take()
         if sample is None:
             return None
         data, info = sample
         client = self._reader.writer_of(info)
         if client is None:
-            return None  # it left before it was heard
+            return None  # the client has left already
         try:
             if not self._endpoint.understands(client):
                 raise ValueError("it came by Fast DDS, whose calls the embedded middleware can not answer")

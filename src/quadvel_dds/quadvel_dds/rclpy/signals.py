@@ -1,13 +1,15 @@
-"""Which signals `rclpy.init` would take over. Here it takes none: Python's own handlers stay.
+"""Options for the signals that `rclpy.init` would handle; here it handles none.
 
-So Ctrl-C raises KeyboardInterrupt in the main thread, and SIGTERM ends the process. A node that is to end cleanly
-however often a signal comes has handlers of its own, as `quadvel_nodes.node.run` does.
+Ctrl-C therefore raises KeyboardInterrupt in the main thread, and SIGTERM ends the process. A node
+that must end cleanly after repeated signals needs its own handlers, see `quadvel_nodes.node.run`.
 """
 
 from enum import IntFlag
 
 
 class SignalHandlerOptions(IntFlag):
+    """Signals to handle, as in rclpy; ignored."""
+
     NO = 0
     SIGINT = 1
     SIGTERM = 2

@@ -1,4 +1,4 @@
-"""Subscriptions."""
+"""Subscriptions of topics."""
 
 from __future__ import annotations
 
@@ -13,11 +13,32 @@ from .logging import get_logger
 
 
 class Subscription(Partial):
+    """Subscription of a topic, see rclpy's Subscription.
+
+    Attributes:
+        msg_type: Class of the messages.
+        topic_name: Full name of the topic.
+        callback: Called with each message, and its information if it takes two arguments.
+        qos_profile: QoS profile.
+        raw: Whether the callback gets CDR bytes.
+    """
+
     def __init__(
         self, subscription_impl: wire.Reader, msg_type: Any, topic: str, callback: Callable[..., Any],
         callback_group: Any, qos_profile: Any, raw: bool, event_callbacks: Any,
     ) -> None:  # fmt: skip
-        """callback: takes the message, as bytes where `raw`, or the message and its information."""
+        """Create a subscription; `Node.create_subscription` calls this.
+
+        Args:
+            subscription_impl: DDS reader.
+            msg_type: Class of the messages.
+            topic: Full name of the topic.
+            callback: Called with each message, and its information if it takes two arguments.
+            callback_group: Ignored.
+            qos_profile: QoS profile.
+            raw: Whether the callback gets CDR bytes.
+            event_callbacks: Ignored.
+        """
         self._reader = subscription_impl
         self.msg_type = msg_type
         self.topic_name = topic
@@ -27,13 +48,19 @@ class Subscription(Partial):
         self._takes_information = not _takes_one(callback)
 
     def get_publisher_count(self) -> int:
+        """Count the publishers that are received.
+
+        Returns:
+            Number of publishers.
+        """
         return self._reader.count()
 
     def destroy(self) -> None:
+        """Delete the reader; `Node.destroy_subscription` calls this."""
         self._reader.close()
 
     def _take(self) -> Callable[[], Any] | None:
-        """The oldest message that waits, as a call of the callback; a malformed one is logged and dropped."""
+        """Return a call of the callback with the oldest message, or None; drop malformed ones."""
         sample = self._reader.take()
         if sample is None:
             return None
@@ -49,6 +76,7 @@ class Subscription(Partial):
 
 
 def _takes_one(callback: Callable[..., Any]) -> bool:
+    """Return whether a callback accepts one argument."""
     try:
         signature(callback).bind(None)
     except TypeError:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from quadvel_follow.follow_planner import PERIOD, State
+from quadvel_follow.follow_planner import PERIOD_S, State
 from quadvel_follow.leg_detector import LegDetector
 
 from .scenes import SCENES, FollowScene
@@ -36,14 +36,14 @@ def following_scores(samples: Sequence[FollowSample], distance: float) -> dict[s
     clearance, gap = min(one.clearance for one in samples), min(one.gap for one in samples)
     walks = np.flatnonzero((np.diff(person, axis=0) != 0.0).any(1))
     away = np.flatnonzero(~inside | (np.hypot(*velocity.T) > 0.1))
-    jerk = np.diff(velocity, n=2, axis=0) / PERIOD**2
+    jerk = np.diff(velocity, n=2, axis=0) / PERIOD_S**2
     took = [one.milliseconds for one in samples]
     return {
         "success": float(
             clearance > 0.0 and gap > 0.0 and inside[-1] and samples[-1].state is State.FOLLOWING
         ),
         "share": float(inside[time >= SETTLING_TIME_S].mean()),
-        "late": max(0.0, PERIOD * float(away[-1] - walks[-1])),
+        "late": max(0.0, PERIOD_S * float(away[-1] - walks[-1])),
         "jerk": float(np.sqrt((jerk**2).sum(1).mean())),
         "clearance": clearance,
         "gap": gap,

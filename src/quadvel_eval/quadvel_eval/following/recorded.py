@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_follow.follow_planner import PERIOD, FollowConfig, State
+from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, State
 from quadvel_follow.planar import planar_pose, planar_twist
 from quadvel_nodes.messages import seconds
 from quadvel_recordings.reading import RecordingError, read_messages
@@ -85,7 +85,7 @@ def _samples(messages: dict[str, list[tuple[float, Any]]], begins: float, world:
     people_times = np.array([seconds(m.header.stamp) for _, m in people_messages])
     state_times = np.array([at for at, _ in messages["/follow_planner/state"]])
     found = []
-    for now in np.arange(max(begins, time[0]), time[-1], PERIOD):
+    for now in np.arange(max(begins, time[0]), time[-1], PERIOD_S):
         i = int(_newest(time, now))
         people = np.array(
             [planar_pose(pose) for pose in people_messages[int(_newest(people_times, now))][1].poses]

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadvel_follow.clearance import outline_distance
-from quadvel_follow.follow_planner import PERIOD, FollowConfig, State
+from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, State
 from quadvel_follow.leg_detector import LegDetector
 from quadvel_policy.command_mux import CommandMux, MuxConfig, MuxInput
 from quadvel_sim.laser import Scan
-from quadvel_sim.walker import circles
+from quadvel_sim.walker import leg_circles
 
 from ..people.laser import FloorPlan, Laser
 from .follower import Follower
@@ -145,7 +145,7 @@ class FollowSimulation:
         Yields:
             Samples, one per planner period.
         """
-        often = round(PERIOD / STEP_S)
+        often = round(PERIOD_S / STEP_S)
         command = np.zeros(3)
         for tick in range(round(self._scene.duration / STEP_S)):
             now = tick * STEP_S
@@ -159,13 +159,13 @@ class FollowSimulation:
                 took = process_time() - begin
                 if self.mute != "planner":
                     self._mux.receive(FOLLOW_INPUT.name, now, plan.velocity)
-                yield self._sample(now, command, plan.state, plan.words, 1e3 * took)
+                yield self._sample(now, command, plan.state, plan.reason, 1e3 * took)
             self.robot.step(command)
             self._move_people()
 
     def _scan_and_track(self, now: float) -> None:
         """Simulate a scan and pass it to the follower."""
-        plan = self._scene.plan.with_circles(circles(self._scene.people))
+        plan = self._scene.plan.with_circles(leg_circles(self._scene.people))
         ranges = self._hit_ground(LASER.scan(plan, self.robot.sensor, self._rng))
         if self.mute == "scan":
             return
@@ -197,9 +197,9 @@ class FollowSimulation:
 
     def _sample(self, now: float, command: Array, state: State, words: str, took: float) -> FollowSample:
         """Sample of the present state."""
-        pose, leg_circles = self.robot.pose, circles(self._scene.people)
+        pose, legs_at = self.robot.pose, leg_circles(self._scene.people)
         standing = outline_distance(self._obstacles[:, :2], pose, self._half) - self._obstacles[:, 2]
-        legs = outline_distance(leg_circles[:, :2], pose, self._half) - leg_circles[:, 2]
+        legs = outline_distance(legs_at[:, :2], pose, self._half) - legs_at[:, 2]
         return FollowSample(
             now,
             pose.copy(),

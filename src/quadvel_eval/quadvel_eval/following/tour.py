@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from quadvel_description.kinematics import rotate, yaw
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL
-from quadvel_follow.follow_planner import PERIOD, FollowConfig, Plan, State
+from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, Plan, State
 from quadvel_follow.pose_history import PoseHistory
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 from quadvel_policy.supervisor import Supervisor
@@ -131,7 +131,7 @@ class Tour:
             distance=self.setup.distance,
             walked=self.walked,
             fell=self.fell,
-            touched=self.simulator.touched,
+            touched=self.simulator.touch_counts,
             planning=self.planning,
         )
 
@@ -144,7 +144,7 @@ class Tour:
         loop, follower, place = self._loop, self._follower, np.zeros(3)
         loop.start_walking()
         commanded, velocity, command = np.zeros(3), np.zeros(3), np.zeros(3)
-        share, often, tick = TICK / AVERAGING_TIME_S, round(PERIOD / TICK), 0
+        share, often, tick = TICK / AVERAGING_TIME_S, round(PERIOD_S / TICK), 0
         last = self.simulator.truth().position[:2].copy()
         plan: Plan | None = None
         while self.walked < self.setup.path_length:
@@ -197,7 +197,7 @@ class Tour:
             commanded,
             velocity,
             plan.state,
-            plan.words,
+            plan.reason,
             self._clearances.to_obstacles(pose),
             self._clearances.to_people(pose, people),
         )
@@ -257,8 +257,8 @@ def summarise_tour(outcome: Outcome, samples: Sequence[TourSample]) -> dict[str,
         "least_clearance": min(one.clearance for one in samples),
         "least_gap": min(one.gap for one in samples),
         "losses": len(begins),
-        "lost_seconds": PERIOD * sum(lost),
-        "seconds": {name: PERIOD * count for name, count in states.items()},
+        "lost_seconds": PERIOD_S * sum(lost),
+        "seconds": {name: PERIOD_S * count for name, count in states.items()},
     }
     if outcome.planning:
         found["planner_ms"] = {

@@ -56,4 +56,4 @@ def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
         console.print(f"written to {out}: tour.json, tour.png; a tour has no video")
     if is_stopped:
         raise KeyboardInterrupt
-    return bool(samples) and not (tour.fell or tour.simulator.touched)
+    return bool(samples) and not (tour.fell or tour.simulator.touch_counts)

@@ -9,7 +9,7 @@ import attrs
 import numpy as np
 from matplotlib.axes import Axes
 
-from quadvel_sim.physics import SECOND
+from quadvel_sim.physics import HELD_OUT_PHYSICS
 
 from ..grid import COMMAND_DURATION_S, PLANTS, Cell, CellResult, evaluate_walk, robot_mass
 from ..walk import Setup, make_loop, record_walk
@@ -19,7 +19,7 @@ from .section import Job, Record, Study, distinct, mean, select
 COMMANDS: tuple[Command, ...] = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.6, 0.0, 0.6))
 """Forward, lateral and curved walk: vx, vy (m/s), wz (rad/s)."""
 LOOSE_JOINTS: Mapping[str, Any] = {
-    "physics": SECOND,
+    "physics": HELD_OUT_PHYSICS,
     "joint_friction": np.zeros(12),
     "joint_damping": np.zeros(12),
 }

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from quadvel_follow.trajectory import SHIPPED, Trajectory, read_table
+from quadvel_follow.trajectory import SHIPPED_FOLDER, Trajectory, read_table
 
 from ..robot_loop import CONTROL_PERIOD_S
 from ..walk import Setup, Walk, make_loop, record_until_fall
@@ -40,7 +40,7 @@ Stroke = tuple[Command, float]  # velocity in the body frame, and duration (s)
 
 def _read_strokes() -> tuple[Stroke, ...]:
     """Read the letters: Z without turning, J from its hook, U sideways to its top."""
-    _, rows = read_table(SHIPPED / "zju.csv")
+    _, rows = read_table(SHIPPED_FOLDER / "zju.csv")
     return tuple(((vx, vy, wz), seconds) for seconds, vx, vy, wz in rows.tolist())
 
 
@@ -57,7 +57,7 @@ def reference_path(strokes: Sequence[Stroke]) -> Array:
         x, y (m) and heading (rad), (n, 3), one row per tick.
     """
     commands, seconds = zip(*strokes, strict=True)
-    return Trajectory.of_commands(seconds, commands, CONTROL_PERIOD_S).pose
+    return Trajectory.from_commands(seconds, commands, CONTROL_PERIOD_S).pose
 
 
 def walked_path(walk: Walk) -> Array:

@@ -101,4 +101,4 @@ class Laser(Scanner):
         Returns:
             Ranges (rays,), m.
         """
-        return self.read(plan.cast(pose[:2], self.angles + pose[2]), rng)
+        return self.measure(plan.cast(pose[:2], self.angles + pose[2]), rng)

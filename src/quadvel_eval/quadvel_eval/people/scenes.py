@@ -8,7 +8,7 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quadvel_sim.walker import Walker, circles
+from quadvel_sim.walker import Walker, leg_circles
 
 from .laser import FloorPlan, Laser
 
@@ -68,7 +68,7 @@ class Scene:
         for k in range(int(self.duration * self.rate)):
             people = np.array([walker.position for walker in self.walkers])
             pose = self.pose(people)
-            ranges = self.laser.scan(self.plan.with_circles(circles(self.walkers)), pose, self.rng)
+            ranges = self.laser.scan(self.plan.with_circles(leg_circles(self.walkers)), pose, self.rng)
             yield SceneScan(k * steps * WALKING_STEP_S, ranges, pose, people)
             for walker in self.walkers:
                 for _ in range(steps):
@@ -191,7 +191,7 @@ def _laser(rng: np.random.Generator) -> Laser:
         angle_increment=resolution,
         noise=rng.uniform(0.005, 0.02),
         range_max=rng.choice([12.0, 30.0]),
-        nothing=rng.choice([0.0, np.nan, np.inf]),
+        no_return=rng.choice([0.0, np.nan, np.inf]),
     )
 
 

@@ -10,14 +10,14 @@ from quadvel_description.state import JointCommand
 from quadvel_sim import SensorNoise, Simulator, SimulatorConfig, Terrain
 
 
-def hung(**changes: object) -> Simulator:
-    simulator = Simulator(SimulatorConfig(hung=True, noise=SensorNoise.none(), **changes))
+def suspended_robot(**changes: object) -> Simulator:
+    simulator = Simulator(SimulatorConfig(suspended=True, noise=SensorNoise.none(), **changes))
     simulator.reset("stand")
     return simulator
 
 
 def test_the_trunk_stays_while_the_legs_swing() -> None:
-    simulator = hung(terrain=Terrain("slope", slope=0.2))
+    simulator = suspended_robot(terrain=Terrain("slope", slope=0.2))
     swing = np.tile([0.2, 0.4, -0.3], 4)
     feet = np.zeros(4, bool)
     for i in range(300):
@@ -26,14 +26,14 @@ def test_the_trunk_stays_while_the_legs_swing() -> None:
         simulator.step()
         feet |= simulator.truth().contact
     truth = simulator.truth()
-    np.testing.assert_allclose(truth.position, [0.0, 0.0, robot.HUNG_HEIGHT], atol=2e-3)
+    np.testing.assert_allclose(truth.position, [0.0, 0.0, robot.SUSPENDED_HEIGHT], atol=2e-3)
     np.testing.assert_allclose(truth.quaternion, [1.0, 0.0, 0.0, 0.0], atol=2e-3)
     assert not feet.any()
     assert not simulator.fallen
 
 
 def test_at_rest_the_drives_hold_the_legs_weight_alone() -> None:
-    simulator = hung(joint_friction=np.zeros(12))
+    simulator = suspended_robot(joint_friction=np.zeros(12))
     command = JointCommand(q=np.array(robot.NOMINAL_Q), kp=np.full(12, 300.0), kd=np.full(12, 5.0))
     for _ in range(150):
         simulator.command(command)
