@@ -35,7 +35,7 @@ go.set()
 
 
 def lines(priority: int, cpus: str = "", spin: float = 0.0, pause: float = 0.0) -> list[str]:
-    """What a process of its own says after `apply`: of its main thread, of an older and a newer one, and in the end."""
+    """Output of a separate process after `apply`: its main thread, an older and a newer thread, and the end."""
     code = APPLY.format(priority=priority, cpus=cpus, spin=spin, pause=pause)
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return result.stdout.splitlines()
