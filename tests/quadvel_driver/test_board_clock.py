@@ -1,4 +1,4 @@
-"""What a board's counter and the arrival of its states tell about when they held."""
+"""Times of states from the board's counter and the arrival times."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ COUNTS = {1e-3: 1, 1e-6: 1000}  # a ms, by unit
 
 
 def stream(clock: BoardClock, states: int, unit: float = 1e-3, first: int = 100, delay=lambda i: 0.0) -> list:
-    """What a clock says of a state each ms from 50 s on; they arrive by `delay` (s) late."""
+    """Times of a clock for states each ms from 50 s on, which arrive `delay` (s) late."""
     return [
         clock.update((first + i * COUNTS[unit]) % 2**32, 50.0 + 1e-3 * i + delay(i)) for i in range(states)
     ]

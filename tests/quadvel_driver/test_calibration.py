@@ -72,7 +72,7 @@ def test_zeros_and_mounting_are_found_together(hung: Samples, standing: Samples)
     assert found.unevenness < 0.005
     assert (found.zero_errors < 1.0 * DEGREE).all()
     off = (found.calibration.joint_zeros - OFF.joint_zeros) / found.zero_errors
-    assert np.sqrt(np.mean(off**2)) < 2.0  # the errors that it tells are those that it makes
+    assert np.sqrt(np.mean(off**2)) < 2.0  # the standard errors match the actual errors
 
 
 def test_an_imu_that_leans_by_two_degrees_is_found_from_standing_alone() -> None:

@@ -102,7 +102,7 @@ class Controller:
 
 
 class RunningBoard:
-    """A board that reports each ms in a thread, until it is stopped, and notes what it is told to do."""
+    """A board that reports each ms in a thread, until it is stopped, and records the commands."""
 
     def __init__(self, board: TestBoard) -> None:
         self.remote = NO_REMOTE
@@ -150,7 +150,7 @@ def running(board: TestBoard) -> Iterator[RunningBoard]:
 
 @pytest.fixture
 def start(board: TestBoard) -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    """Starts the node, told where the board is; it ends with the test."""
+    """Start the node with the address of the board; it ends with the test."""
     started: list[subprocess.Popen[str]] = []
 
     def begin(**parameters: object) -> subprocess.Popen[str]:
@@ -166,7 +166,7 @@ def start(board: TestBoard) -> Iterator[Callable[..., subprocess.Popen[str]]]:
 
     yield begin
     for process in started:
-        process.send_signal(signal.SIGINT)  # cleanly, so that nobody hears of its topics any more
+        process.send_signal(signal.SIGINT)  # cleanly, so that its topics disappear
         process.communicate(timeout=40.0)
 
 
@@ -242,7 +242,7 @@ def test_commands_that_are_not_fit_are_refused_and_named(
 
 
 def press(running: RunningBoard, controller: Controller, order: OperatorCommand) -> None:
-    """Hold the buttons of an order down for a moment, and let go."""
+    """Press the buttons of a command for a moment."""
     for remote in (Remote(BUTTONS[order]), NO_REMOTE):
         running.remote = remote
         seen = len(controller.heard["low_state"])

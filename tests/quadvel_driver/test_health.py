@@ -1,4 +1,4 @@
-"""What the driver says of robot and link."""
+"""Health of robot and link."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def test_a_stop_stays_until_it_is_released_and_nothing_else_counts_meanwhile(pil
         assert press(pilot, BUTTONS[order]) is None
     assert pilot.stopped
     assert press(pilot, BUTTONS[OperatorCommand.RELEASE]) is OperatorCommand.RELEASE
-    assert pilot.stopped  # whoever carries it out decides
+    assert pilot.stopped  # the caller resets it
     pilot.stopped = False
     assert press(pilot, BUTTONS[OperatorCommand.STAND_UP]) is OperatorCommand.STAND_UP
 

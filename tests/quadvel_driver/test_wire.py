@@ -24,7 +24,7 @@ SEED_OF_GOLDEN = JointCommand(
 
 
 def slow_crc(data: bytes) -> int:
-    """Bit by bit, as the polynomial says."""
+    """The CRC bit by bit, from its polynomial."""
     crc = 0xFFFFFFFF
     for (word,) in struct.iter_unpack("<I", data):
         for bit in range(31, -1, -1):
@@ -152,7 +152,7 @@ def test_a_command_comes_back_within_the_resolution_of_the_packet(
         np.testing.assert_allclose(back.q, q, rtol=1e-6, atol=1e-30)
         np.testing.assert_allclose(back.dq, dq, rtol=1e-6, atol=1e-30)
         for sent, got, step in ((tau, back.tau, 1 / 256), (kp, back.kp, 1 / 32), (kd, back.kd, 1 / 16)):
-            assert (np.abs(got) <= np.abs(sent) + 1e-4).all()  # towards zero, never more than was asked for
+            assert (np.abs(got) <= np.abs(sent) + 1e-4).all()  # towards zero, never more than commanded
             np.testing.assert_allclose(got, sent, atol=step + 1e-4)
 
 
@@ -239,7 +239,7 @@ LARGEST = float(np.finfo(np.float32).max)
 
 @st.composite
 def states(draw: st.DrawFn, number: st.SearchStrategy[float] = NUMBER) -> BoardState:
-    """Any that is made of such numbers, whatever a robot can do."""
+    """Any record of such numbers, also impossible ones."""
     state = some_state(draw(st.integers(0, 1000)))
     for field in ("q", "dq", "tau", "quaternion", "angular_velocity", "linear_acceleration", "foot_force"):
         values = getattr(state.robot, field)
@@ -274,7 +274,7 @@ def test_whatever_the_state_a_flipped_bit_is_noticed(state: BoardState, bit: int
 def test_any_bytes_with_the_right_crc_are_finite_numbers_or_refused(
     data: st.DataObject, packet: bytes
 ) -> None:
-    """What the CRC cannot tell: that whoever computed it meant well."""
+    """Malicious content with a valid CRC."""
     length = len(packet) - 12
     start = data.draw(st.integers(0, length))
     forged = bytearray(packet)

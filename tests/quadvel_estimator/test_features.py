@@ -35,7 +35,7 @@ GOLDEN = np.array(
         *[0.0, -1.0, 0.0],  # gravity
         *[-0.6, -0.5, -0.4, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3, 0.4, 0.5],  # previous action
         *[-0.3, -0.25, -0.2, -0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15, 0.2, 0.25],  # torque
-        # half of what each leg says, from finite differences of its contact point
+        # half of the velocity of each leg, from finite differences of its contact point
         *[0.58533, -0.31295, 0.22090],
         *[1.61624, -0.92220, 0.09208],
         *[2.50133, -1.42758, 0.67370],

@@ -143,7 +143,7 @@ def test_each_leg_tells_the_velocity_that_lets_its_contact_point_rest(standing: 
     dq, omega = rng.normal(size=12), rng.normal(size=3)
     attitude = Rotation.from_euler("ZYX", [1.0, 0.3, -0.2])
     state = standing(0.0, q=q, dq=dq, angular_velocity=omega, quaternion=attitude.as_quat(scalar_first=True))
-    told = leg_velocity(state)
+    velocity_by_leg = leg_velocity(state)
 
     def calf(q: np.ndarray, leg: int) -> Rotation:
         hip, thigh, knee = q[3 * leg : 3 * leg + 3]
@@ -158,7 +158,7 @@ def test_each_leg_tells_the_velocity_that_lets_its_contact_point_rest(standing: 
             return turned.apply(foot_positions(moved)[leg] + calf(moved, leg).apply(fixed))
 
         slide = (contact(1e-6) - contact(-1e-6)) / 2e-6  # world frame, while the trunk's origin stays
-        np.testing.assert_allclose(attitude.apply(told[leg]), -slide, atol=1e-7)
+        np.testing.assert_allclose(attitude.apply(velocity_by_leg[leg]), -slide, atol=1e-7)
 
 
 def test_joint_torques_tell_the_weight_on_each_foot() -> None:

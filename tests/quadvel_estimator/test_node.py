@@ -116,7 +116,7 @@ def test_a_stall_of_the_whole_machine_moves_nothing(bench: Bench) -> None:
         bench.wait(lambda n=i: len(bench.heard["velocity_estimate"]) == n + 1)
     bench.wait(lambda: bench.heard["odom"])
     speeds = [answer.twist.twist.linear.x for answer in bench.heard["velocity_estimate"]]
-    np.testing.assert_allclose(np.diff(speeds), 0.5, atol=1e-5)  # the network goes on from where it was
+    np.testing.assert_allclose(np.diff(speeds), 0.5, atol=1e-5)  # the network keeps its state
     assert bench.heard["odom"][0].pose.pose.position.x == pytest.approx(0.005 * sum(speeds[1:]))
     bench.diagnosed("0.195")
 
@@ -139,7 +139,7 @@ def test_odometry_and_transform_agree_and_carry_the_imu_s_orientation(bench: Ben
 
 
 def test_height_is_that_above_the_feet_and_said_to_be_unknown(bench: Bench, standing: State) -> None:
-    """Whatever the vertical velocity of the estimate adds up to."""
+    """Height is independent of the estimated vertical velocity."""
     for i in range(40):
         bench.send(0.005 * i)
         bench.wait(lambda n=i: len(bench.heard["velocity_estimate"]) == n + 1)
@@ -190,7 +190,7 @@ def test_a_wrong_parameter_ends_the_start_with_one_sentence(
 
 
 def launch(*arguments: str) -> subprocess.Popen[str]:
-    """The node in a process of its own."""
+    """The node in a separate process."""
     program = "import quadvel_dds; quadvel_dds.install(); from quadvel_estimator import estimator"
     return subprocess.Popen(
         [sys.executable, "-c", f"{program}; estimator.main()", "--ros-args", *arguments],

@@ -35,7 +35,7 @@ go.set()
 
 
 def lines(priority: int, cpus: str = "", spin: float = 0.0, pause: float = 0.0) -> list[str]:
-    """What a process of its own says after `apply`: of its main thread, of an older and a newer one, and in the end."""
+    """Output of a separate process after `apply`: its main thread, an older and a newer thread, and the end."""
     code = APPLY.format(priority=priority, cpus=cpus, spin=spin, pause=pause)
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return result.stdout.splitlines()
@@ -76,9 +76,9 @@ def test_threads_ask_for_a_short_slice_and_those_that_they_start_do_so_too() -> 
         pytest.skip("the kernel gives all threads the same slice, as before Linux 6.12")
     code = APPLY.format(priority=0, cpus="", spin=0.0, pause=0.0)
     code = code.replace(
-        "def scheduled(thread):", "from quadvel_nodes.scheduling import slice_of\ndef scheduled(thread):"
+        "def scheduled(thread):", "from quadvel_nodes.scheduling import time_slice\ndef scheduled(thread):"
     )
-    code = code.replace("return policy,", "return slice_of(thread), policy,")
+    code = code.replace("return policy,", "return time_slice(thread), policy,")
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert [line.split()[0] for line in result.stdout.splitlines()] == [str(TIME_SLICE_NS)] * 4
 
@@ -105,9 +105,9 @@ def test_what_makes_no_sense_is_refused_by_name(parameters: dict[str, object], s
 YIELDING = """
 import os
 from pathlib import Path
-from quadvel_nodes.scheduling import AUTOGROUP, run_after_others
+from quadvel_nodes.scheduling import AUTOGROUP_FILE, run_after_others
 run_after_others(10)
-print(os.nice(0), AUTOGROUP.read_text().split()[-1])
+print(os.nice(0), AUTOGROUP_FILE.read_text().split()[-1])
 """
 
 

@@ -48,7 +48,7 @@ def test_a_clock_that_is_set_back_starts_a_new_grid() -> None:
 def test_samples_whose_clock_drifts_are_all_answered_though_their_stamps_jitter(
     drift: float, rate: int
 ) -> None:
-    """A board's crystal against the one of the machine: after a minute they are more than a period apart."""
+    """Clock drift of the board: after a minute, the clocks differ by more than a period."""
     jitter = np.random.default_rng(0).normal(0.0, 1e-4, 120 * rate)
     counts = np.array(answered((1.0 + drift) * np.arange(120 * rate) / rate + jitter))
     assert set(counts) == ({1} if rate == 200 else {0, 1})

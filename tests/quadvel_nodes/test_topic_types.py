@@ -1,4 +1,4 @@
-"""Publishers of another type than a topic's subscriptions: who would say nothing is heard."""
+"""Warnings about publishers whose type differs from the subscriptions of a topic."""
 
 from __future__ import annotations
 
@@ -75,10 +75,10 @@ def test_a_node_warns_once_of_each_conflict(
     listener, talker = make("listener"), make("talker")
     listener.create_subscription(Twist, "cmd_vel", lambda _: None, 10)
     talker.create_publisher(TwistStamped, "cmd_vel", 10)
-    said: list[str] = []
-    monkeypatch.setattr(listener.get_logger(), "warning", said.append)
+    warnings: list[str] = []
+    monkeypatch.setattr(listener.get_logger(), "warning", warnings.append)
     watch = ConflictWatch(listener)
-    assert until(lambda: watch.check() or said)
+    assert until(lambda: watch.check() or warnings)
     watch.check()
-    assert len(said) == 1
-    assert "stamped:=true" in said[0]
+    assert len(warnings) == 1
+    assert "stamped:=true" in warnings[0]

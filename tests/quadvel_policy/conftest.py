@@ -1,6 +1,6 @@
 """A policy without training, and a ROS graph of one node under test and a peer that moves time.
 
-The policy is a tiny LSTM written with onnx.helper, or a stub that says what it was asked.
+The policy is a tiny LSTM written with onnx.helper, or a stub that records its inputs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import quadvel_dds
 from quadvel_description.robot import KD, KP, NOMINAL_Q
 from quadvel_policy.observation import PolicyMetadata
 
-sys.path.insert(0, str(Path(__file__).parent))  # `rig` lies beside the tests
+sys.path.insert(0, str(Path(__file__).parent))  # for `rig`
 quadvel_dds.install()  # before a test module imports rclpy
 
 import rclpy  # noqa: E402
@@ -217,17 +217,17 @@ class Graph:
         return message
 
     def diagnosed(self, text: str) -> Any:
-        """Wait until the node's /diagnostics says `text` in its message or a value; returns that status."""
+        """Wait until the node's /diagnostics contains `text` in its message or a value; return that status."""
 
-        def said() -> Any:
+        def matching_status() -> Any:
             for status in (status for array in self.diagnostics for status in array.status):
                 texts = [status.message, *(f"{pair.key}: {pair.value}" for pair in status.values)]
                 if any(text in line for line in texts):
                     return status
             return None
 
-        self.wait(said)
-        return said()
+        self.wait(matching_status)
+        return matching_status()
 
     def close(self) -> None:
         self._executor.shutdown()

@@ -20,7 +20,7 @@ FORWARD = (0.5, 0.0, 0.0, 0.0)
 
 
 class Rig:
-    """A robot whose joints follow their targets at once, driven at 200 Hz."""
+    """A robot whose joints follow their targets immediately, driven at 200 Hz."""
 
     def __init__(
         self, policy: Any, guards: Iterable[type[Guard]] = GUARDS, backup: Any = None, **config: Any

@@ -175,15 +175,15 @@ STOPS = st.tuples(st.sampled_from(["lock", "other lock", "stance"]), st.booleans
 EVENTS = st.lists(st.tuples(WAIT, SPEAKS | STOPS), max_size=40)
 
 
-class Told:
-    """A mux, and what it was told, kept in a simpler way: to hold what it says against."""
+class ReferenceMux:
+    """A mux, and a simpler model of its inputs as the reference for its output."""
 
     def __init__(self) -> None:
         self.mux = CommandMux([TELEOP, PLANNER], BRISK)
         self.now, self.last = 0.0, self.mux.update(0.0)
         self.heard: dict[MuxInput, float] = {}
 
-    def tell(self, event: tuple[Any, Any]) -> None:
+    def apply(self, event: tuple[Any, Any]) -> None:
         who, what = event
         if isinstance(who, MuxInput):
             if np.isfinite(what).all():
@@ -202,7 +202,7 @@ class Told:
         return bool(self.mux.locks) or self.mux.stance_requested
 
     def winner(self) -> str:
-        """By what was told: the first that is fresh, in the order of priority."""
+        """Return the fresh input with the highest priority, according to the model."""
         self.heard = {one: at for one, at in self.heard.items() if at <= self.now}
         fresh = [one.name for one, at in self.heard.items() if self.now - at <= one.timeout]
         return "none" if self.stopped or not fresh else "teleop" if "teleop" in fresh else "planner"
@@ -225,7 +225,7 @@ class Told:
         for _ in range(round(seconds / PERIOD)):
             self.now += PERIOD
             for event in events:
-                self.tell(event)
+                self.apply(event)
             output = self.check(PERIOD)
         return output
 
@@ -233,17 +233,17 @@ class Told:
 @given(EVENTS, st.sampled_from(["silence", "lock", "stance"]))
 @settings(max_examples=100)
 def test_whatever_happens_the_command_is_bounded_and_can_be_stopped(events: list[Any], stop: str) -> None:
-    told = Told()
+    reference = ReferenceMux()
     for wait, event in events:
-        told.now += wait
-        told.tell(event)
-        told.check(wait)
+        reference.now += wait
+        reference.apply(event)
+        reference.check(wait)
     ramp = max(np.divide(BRISK.max_velocity, BRISK.stop_acceleration))
     if stop == "silence":
-        output = told.pass_time(TELEOP.timeout + ramp + 2 * PERIOD)
+        output = reference.pass_time(TELEOP.timeout + ramp + 2 * PERIOD)
     else:
-        told.tell((stop, True))
-        output = told.pass_time(ramp + 2 * PERIOD, (TELEOP, (1.0, -1.0, 1.0)))
+        reference.apply((stop, True))
+        output = reference.pass_time(ramp + 2 * PERIOD, (TELEOP, (1.0, -1.0, 1.0)))
     assert (output.stance, output.source) == (True, "none")
     assert not output.velocity.any()
 
@@ -253,14 +253,14 @@ def test_whatever_happens_the_command_is_bounded_and_can_be_stopped(events: list
 def test_whatever_happened_the_highest_priority_is_followed_once_nothing_stops_it(
     events: list[Any], velocity: tuple[float, ...]
 ) -> None:
-    told = Told()
+    reference = ReferenceMux()
     for wait, event in events:
-        told.now += wait
-        told.tell(event)
-        told.check(wait)
-    told.mux.locks.clear()
-    told.mux.stance_requested = False
-    output = told.pass_time(4.0, (TELEOP, velocity), (PLANNER, (1.0, 0.0, 0.0)))
+        reference.now += wait
+        reference.apply(event)
+        reference.check(wait)
+    reference.mux.locks.clear()
+    reference.mux.stance_requested = False
+    output = reference.pass_time(4.0, (TELEOP, velocity), (PLANNER, (1.0, 0.0, 0.0)))
     followed = np.clip(velocity, np.negative(BRISK.max_velocity), BRISK.max_velocity)
     expected = followed if (np.abs(velocity) >= BRISK.dead_zone).any() else np.zeros(3)
     np.testing.assert_allclose(output.velocity, expected)

@@ -1,4 +1,4 @@
-"""The node `controller` over DDS: it answers states, refuses what is unfit, and says why."""
+"""The node `controller` over DDS: it answers states, and refuses invalid messages with a reason."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PERIOD = 0.005
 class Robot:
     """A standing robot in lockstep with the controller: each state waits for its answer.
 
-    velocity: what the estimator says of each state, None where it is silent.
+    velocity: estimate for each state, None for no message.
     """
 
     def __init__(self, graph: Any) -> None:
@@ -362,9 +362,7 @@ def test_states_that_go_back_in_time_become_that_fault(robot: Robot) -> None:
     robot.stand()
     for k in range(8):
         robot.graph.pass_time(0.01)
-        robot.send(
-            robot.message(-0.01 * (k + 3))
-        )  # all of them held at one instant, before the last good one
+        robot.send(robot.message(-0.01 * (k + 3)))  # all have the same stamp, older than the last valid one
     assert robot.report("fault").fault == "state_back_in_time"
 
 

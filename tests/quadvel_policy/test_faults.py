@@ -1,4 +1,4 @@
-"""Every row of the table of faults: what brings it about, what follows and how soon, and that its guard is what finds it."""
+"""Every row of the table of faults: its cause, response and reaction time, and that its guard detects it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from quadvel_policy.guards import GUARDS, EncoderInconsistent, ideal_torque
 from quadvel_policy.supervisor import SUPERVISOR_FAULTS
 
 Changes = dict[str, Any]
-"""What is changed of the state of one tick, its age, or the time since the one before"""
+"""Changes of the state of one tick, its age, or the time since the previous one"""
 NOT_A_NUMBER = np.full(12, np.nan)
 
 
@@ -37,7 +37,7 @@ class Case:
 
 
 class Backup:
-    """A filter that knows the velocity, unless it is told to fail."""
+    """A filter with a settable velocity, which fails if that is not finite."""
 
     def __init__(self) -> None:
         self.velocity = np.zeros(3)
@@ -106,7 +106,7 @@ def stuck_joint(rig: Rig, k: int) -> Changes:
 
 
 def stopped(rig: Rig, seconds: float) -> Changes:
-    """The controller does not run for this long, and the robot goes on."""
+    """The controller does not run for this long, while the robot continues."""
     rig.supervisor.stopped = seconds
     return {"step": seconds}
 
@@ -253,9 +253,9 @@ def check_stance(rig: Rig, case: Case, name: str) -> None:
     assert not rig.supervisor.request("walk")[0]
     if name != "imu_frozen":
         rig.tick(**case.bring(rig, 0))
-        taken, told = rig.supervisor.request("stance")
-        assert not taken
-        assert "still there" in told
+        accepted, message = rig.supervisor.request("stance")
+        assert not accepted
+        assert "still there" in message
     case.mend(rig)
     rig.run(2.0, FORWARD)
     assert rig.mode == "stance"  # the operator has the say
@@ -469,7 +469,7 @@ def test_the_table_has_a_row_for_each_guard_limit_and_other_fault() -> None:
 
 def test_the_page_of_faults_is_what_the_code_prints() -> None:
     printed = Path(__file__).parents[2] / "docs" / "faults.md"
-    assert printed.read_text() == page(), "write it anew: python -m quadvel_policy.faults > docs/faults.md"
+    assert printed.read_text() == page(), "run: python -m quadvel_policy.faults > docs/faults.md"
 
 
 def test_a_simulated_robot_goes_on_after_states_that_were_lost(policy: Any) -> None:

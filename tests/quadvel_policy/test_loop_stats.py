@@ -1,4 +1,4 @@
-"""What a periodic loop says about its times."""
+"""Timing statistics of a periodic loop."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ STILL, FORWARD = (0.0, 0.0, 0.0, 1.0), (0.5, 0.0, 0.0, 0.0)
 
 
 class Run:
-    """A standing robot, and what is said of it."""
+    """A standing robot and the log of its supervisor."""
 
     def __init__(self, policy: Any) -> None:
         self.supervisor = Supervisor(policy, SupervisorConfig())
@@ -23,8 +23,8 @@ class Run:
         self._ticks = 0
 
     def tick(self, command: Any, count: int = 1) -> list[tuple[bool, str]]:
-        """What is said during some ticks."""
-        said = []
+        """Return the log of some ticks."""
+        sentences = []
         for _ in range(count):
             self._ticks += 1
             zeros, upright = np.zeros(12), np.array([1.0, 0.0, 0.0, 0.0])
@@ -33,8 +33,8 @@ class Run:
                 time, 5 * self._ticks, NOMINAL_Q, zeros, zeros, upright, zeros[:3], zeros[:3], zeros[:4]
             )
             self.supervisor.tick(time, state, np.zeros(3), command)
-            said += self.announcements.changes()
-        return said
+            sentences += self.announcements.changes()
+        return sentences
 
 
 def test_each_change_is_told_once_and_a_fault_with_the_way_out_of_it(policy: Any) -> None:

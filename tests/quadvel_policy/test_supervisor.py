@@ -115,7 +115,7 @@ def test_walking_feeds_the_policy_and_uses_its_gains_and_targets(rig: Rig) -> No
     rig.tick((9.0, -9.0, 0.3, 0.0))
     rig.tick((9.0, -9.0, 0.3, 0.0))
     seen = rig.policy.seen[-1]
-    np.testing.assert_allclose(seen[:4], [1.5, -0.5, 0.3, 0.0], atol=1e-6)  # held to the policy's limits
+    np.testing.assert_allclose(seen[:4], [1.5, -0.5, 0.3, 0.0], atol=1e-6)  # clamped to the policy's limits
     np.testing.assert_allclose(seen[30:33], rig.velocity, atol=1e-6)
     np.testing.assert_allclose(seen[36:], rig.policy.action)
     np.testing.assert_allclose(rig.asked.target, rig.policy.metadata.action.targets(rig.policy.action))
@@ -171,8 +171,8 @@ def test_on_a_robot_the_operator_allows_walking_first(policy: Any) -> None:
     rig.run(0.1, FORWARD)
     assert rig.mode == "stance"
     assert "enable_walking" in rig.supervisor.walk_refusal
-    taken, sentence = rig.supervisor.request("walk")
-    assert not taken
+    accepted, sentence = rig.supervisor.request("walk")
+    assert not accepted
     assert "enable_walking" in sentence
     rig.supervisor.enable_walking(True)
     rig.tick(FORWARD)
@@ -252,13 +252,13 @@ def test_lying_down_ends_passive(rig: Rig) -> None:
 
 def test_walking_ends_in_a_posture_only_when_the_robot_stands(rig: Rig) -> None:
     rig.walk()
-    taken, sentence = rig.supervisor.request("lie_down")
-    assert not taken
+    accepted, sentence = rig.supervisor.request("lie_down")
+    assert not accepted
     assert "command stance first" in sentence
     rig.velocity = np.array([0.6, 0.0, 0.0])
     rig.tick(STILL)
-    taken, sentence = rig.supervisor.request("stance")
-    assert not taken
+    accepted, sentence = rig.supervisor.request("stance")
+    assert not accepted
     assert "0.60 m/s" in sentence
     rig.velocity = np.zeros(3)
     rig.tick(STILL)
@@ -270,8 +270,8 @@ def test_walking_ends_in_a_posture_only_when_the_robot_stands(rig: Rig) -> None:
 
 def test_a_standing_robot_may_go_to_stance_at_once_and_a_lying_one_may_not(rig: Rig) -> None:
     rig.tick()
-    taken, sentence = rig.supervisor.request("stance")
-    assert not taken
+    accepted, sentence = rig.supervisor.request("stance")
+    assert not accepted
     assert "off the nominal posture" in sentence
     rig.state.q = NOMINAL_Q + 0.05
     rig.tick()
@@ -283,16 +283,16 @@ def test_a_standing_robot_may_go_to_stance_at_once_and_a_lying_one_may_not(rig: 
 )
 def test_modes_out_of_order_are_refused(rig: Rig, mode: str, sentence: str) -> None:
     rig.tick()
-    taken, message = rig.supervisor.request(mode)
-    assert not taken
+    accepted, message = rig.supervisor.request(mode)
+    assert not accepted
     assert sentence in message
     assert rig.mode == "passive"
 
 
 @pytest.mark.parametrize("mode", ["fault", "fly", ""])
 def test_unknown_modes_are_refused_by_name(rig: Rig, mode: str) -> None:
-    taken, message = rig.supervisor.request(mode)
-    assert not taken
+    accepted, message = rig.supervisor.request(mode)
+    assert not accepted
     assert message == f"mode is '{mode}', expected one of passive, stand_up, stance, walk, lie_down"
 
 
@@ -303,15 +303,15 @@ def test_nothing_but_passive_is_taken_before_the_robot_reported(rig: Rig) -> Non
 
 def test_a_robot_on_its_side_is_not_stood_up(rig: Rig) -> None:
     rig.tick(quaternion=np.array([math.cos(0.7), math.sin(0.7), 0.0, 0.0]))
-    taken, message = rig.supervisor.request("stand_up")
-    assert not taken
+    accepted, message = rig.supervisor.request("stand_up")
+    assert not accepted
     assert message == "the trunk is tilted by 1.40 rad, limit 1.05"
 
 
 def test_a_stale_state_refuses_standing_up(rig: Rig) -> None:
     rig.tick(age=0.2)
-    taken, message = rig.supervisor.request("stand_up")
-    assert not taken
+    accepted, message = rig.supervisor.request("stand_up")
+    assert not accepted
     assert message == "the state is 200 ms old, limit 50 ms"
 
 
@@ -362,8 +362,8 @@ def test_a_limp_robot_is_not_brought_into_fault(rig: Rig) -> None:
 def test_passive_clears_a_fault_and_nothing_else_does(rig: Rig) -> None:
     rig.walk()
     rig.tick(age=1.0)
-    taken, message = rig.supervisor.request("stand_up")
-    assert not taken
+    accepted, message = rig.supervisor.request("stand_up")
+    assert not accepted
     assert message == "is in fault (the state is 1000 ms old, limit 50 ms), request passive first"
     assert rig.supervisor.request("passive")[0]
     rig.stand()
@@ -442,7 +442,7 @@ def test_limits_of_the_command_come_from_the_policy(metadata: PolicyMetadata, ri
 def test_commands_are_held_together_where_the_policy_says_how(make_policy: Callable[..., Any]) -> None:
     rig = Rig(make_policy(curve_limit=0.6))  # -1 to 1.5, 0.5 m/s, 1 rad/s
     rig.walk()
-    for asked, taken in (
+    for command, expected in (
         ((0.0, 0.0, 9.0), (0.0, 0.0, 1.0)),
         ((1.5, 0.0, 1.0), (1.5, 0.0, 0.0)),
         ((0.75, 0.0, -1.0), (0.75, 0.0, -0.6 * 0.75 / 0.75)),
@@ -451,5 +451,5 @@ def test_commands_are_held_together_where_the_policy_says_how(make_policy: Calla
         ((9.0, 9.0, 1.0), (1.5 / np.sqrt(2), 0.5 / np.sqrt(2), 0.0)),
         ((-1.0, 0.5, 0.0), (-1.0 / np.sqrt(2), 0.5 / np.sqrt(2), 0.0)),
     ):
-        rig.tick((*asked, 0.0))
-        np.testing.assert_allclose(rig.supervisor.command, [*taken, 0.0], atol=1e-12, err_msg=str(asked))
+        rig.tick((*command, 0.0))
+        np.testing.assert_allclose(rig.supervisor.command, [*expected, 0.0], atol=1e-12, err_msg=str(command))
