@@ -27,6 +27,7 @@ ROSDEP = {
     "rich": "python3-rich",
     "scipy": "python3-scipy",
     "typer": "python3-typer",
+    "typing_extensions": "python3-typing-extensions",
     "websockets": "python3-websockets",
     "yaml": "python3-yaml",
 }
@@ -46,6 +47,7 @@ PIP = {
     "foxglove": "foxglove-sdk",
     "google": "protobuf",
     "imageio_ffmpeg": "imageio-ffmpeg",
+    "typing_extensions": "typing-extensions",
     "yaml": "pyyaml",
 }
 """Distributions that bring modules; of the module's name unless given"""

@@ -1,4 +1,4 @@
-"""The embedded middleware for the tests of this folder."""
+"""Fixtures of the embedded middleware."""
 
 import subprocess
 import sys
@@ -35,7 +35,7 @@ def ros() -> Iterator[Callable[..., None]]:
 
 @pytest.fixture
 def spin_until() -> Callable[..., bool]:
-    """Spins a node until a condition holds or the time is up, and says whether it holds."""
+    """Spin a node until a condition holds or a timeout; return whether it holds."""
     import rclpy
 
     def spin(node: Any, condition: Callable[[], Any], timeout: float = 20.0) -> bool:

@@ -1,4 +1,4 @@
-"""Command-line arguments, parameter files and names."""
+"""Tests of command-line arguments, parameter files and names."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Which rclpy a process gets."""
+"""Tests of the choice of rclpy for a process."""
 
 from __future__ import annotations
 

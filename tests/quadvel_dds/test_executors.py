@@ -1,4 +1,4 @@
-"""Executors: what runs side by side, what an error in a callback does, how a spin ends."""
+"""Tests of executors: concurrency, errors in callbacks, end of a spin."""
 
 import threading
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Message classes, and their bytes against the reference serialisation of rosbags."""
+"""Tests of message classes and their bytes against rosbags' reference serialization."""
 
 import array
 import subprocess

@@ -1,4 +1,4 @@
-"""Nodes in one process: names, services, logs, beginning and end."""
+"""Tests of nodes in one process: names, services, logs, creation and destruction."""
 
 from collections.abc import Callable
 from typing import Any
@@ -29,10 +29,10 @@ def test_node_names_are_told_to_ros(ros: Start) -> None:
     profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     reader = node.context.participant.reader("ros_discovery_info", ParticipantEntitiesInfo.TYPENAME, profile)
     data, _ = reader.take()
-    (told,) = messages.deserialize(data, ParticipantEntitiesInfo.TYPENAME).node_entities_info_seq
-    assert (told.node_namespace, told.node_name) == ("/robot", "mux")
-    assert len(told.writer_gid_seq) == 1 + 6  # /rosout and the parameter services
-    assert len(told.reader_gid_seq) == 6
+    (info,) = messages.deserialize(data, ParticipantEntitiesInfo.TYPENAME).node_entities_info_seq
+    assert (info.node_namespace, info.node_name) == ("/robot", "mux")
+    assert len(info.writer_gid_seq) == 1 + 6  # /rosout and the parameter services
+    assert len(info.reader_gid_seq) == 6
 
 
 def test_security_that_is_not_here_is_not_pretended(ros: Start, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Parameters of a node: defaults, overrides, services."""
+"""Tests of a node's parameters: defaults, overrides, services."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Several processes: discovery, signals, and which middleware `install` chooses."""
+"""Tests with several processes: discovery, signals, and the choice of the middleware."""
 
 import signal
 import subprocess

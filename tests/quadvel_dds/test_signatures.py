@@ -1,4 +1,4 @@
-"""What is offered has the names, parameters and defaults of rclpy 7.1.3 (Jazzy), or it says so."""
+"""Tests that names, parameters and defaults are those of rclpy 7.1.3 (Jazzy) or unsupported."""
 
 import importlib
 import inspect

@@ -1,4 +1,4 @@
-"""Time: timers, simulated time, points in time and spans."""
+"""Tests of timers, simulated time, times and durations."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Topics: delivery, quality of service, and what stands on the wire."""
+"""Tests of topics: delivery, quality of service, and the format on the wire."""
 
 import math
 import time

@@ -1,4 +1,4 @@
-"""A network cut in two gives what the whole one gives, however its products are written."""
+"""Tests of split networks: the parts compute what the whole network computes."""
 
 from __future__ import annotations
 

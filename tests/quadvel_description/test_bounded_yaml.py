@@ -1,4 +1,4 @@
-"""YAML that would cost much more than its text is refused in a sentence."""
+"""Tests that YAML whose cost exceeds its length is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is sent where a target lies beyond the range of commands."""
+"""Tests of joint targets beyond the command range."""
 
 import numpy as np
 import pytest

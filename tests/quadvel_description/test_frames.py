@@ -1,4 +1,4 @@
-"""The tree of frames: one parent each, and every link where MuJoCo has it."""
+"""Tests of the frame tree: one parent each, and the poses of MuJoCo."""
 
 from __future__ import annotations
 

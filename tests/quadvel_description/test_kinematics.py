@@ -1,4 +1,4 @@
-"""Closed-form kinematics against MuJoCo, finite differences and SciPy's rotations."""
+"""Tests of kinematics against MuJoCo, finite differences and SciPy's rotations."""
 
 import mujoco
 import numpy as np

@@ -1,4 +1,4 @@
-"""The MJCF: its postures stand and lie as their names say, and it takes the parameters of its plant."""
+"""Tests of the MJCF: postures, and the parameters of its plant."""
 
 import mujoco
 import numpy as np
@@ -43,7 +43,7 @@ def test_the_torque_against_gravity_carries_the_weight_of_the_trunk_on_the_feet(
     model = mjcf.load_model()
     feet = kinematics.foot_jacobians(robot.NOMINAL_Q)
     data = _in(model, "stand")
-    legs = data.qfrc_bias[6:].reshape(4, 3)  # the legs' own weight, on a trunk that is held
+    legs = data.qfrc_bias[6:].reshape(4, 3)  # the legs' weight on a fixed trunk
     torque = mjcf.gravity_torque(model).reshape(4, 3)
     force = np.linalg.solve(np.swapaxes(feet, 1, 2), (legs - torque)[..., None])[..., 0]
     np.testing.assert_allclose(force, np.tile([0, 0, robot.MASS * robot.GRAVITY / 4], (4, 1)), atol=1e-6)

@@ -1,4 +1,4 @@
-"""A network file is data: whatever else is in it is refused in one sentence, before anything runs it."""
+"""Tests that a network file with anything but a data-flow graph is refused before it runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def network() -> ModelProto:
 
 
 def weights_elsewhere(model: ModelProto) -> None:
-    """They are said to lie in a file of the system's."""
+    """The data refer to a system file."""
     weights = model.graph.initializer[0]
     weights.ClearField("raw_data")
     weights.data_location = TensorProto.EXTERNAL

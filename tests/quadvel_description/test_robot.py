@@ -1,4 +1,4 @@
-"""The joint and link tables against Unitree's own numbers."""
+"""Tests of the joint and link tables against Unitree's numbers."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The symmetry map of Table 1: an involution, and the truth about the robot's mirror image in MuJoCo."""
+"""Tests of the mirror of Table 1: an involution that matches the mirror image in MuJoCo."""
 
 import mujoco
 import numpy as np

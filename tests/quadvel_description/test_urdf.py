@@ -1,4 +1,4 @@
-"""The URDF says the same as the MJCF; MuJoCo reads both."""
+"""Tests that the URDF equals the MJCF; MuJoCo reads both."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -104,4 +104,6 @@ def test_links_form_one_tree_below_a_root_without_inertia():
 
 
 def test_the_installed_file_is_the_present_urdf():
-    assert INSTALLED.read_text() == urdf(), f"write it anew: python -m quadvel_description.urdf > {INSTALLED}"
+    assert INSTALLED.read_text() == urdf(), (
+        f"write it again: python -m quadvel_description.urdf > {INSTALLED}"
+    )

@@ -1,4 +1,4 @@
-"""Where the recordings of people are, if they are."""
+"""Fixtures: recordings of people, if they are available."""
 
 from __future__ import annotations
 

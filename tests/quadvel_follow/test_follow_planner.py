@@ -1,4 +1,4 @@
-"""What a robot that follows a person does where it can not, and what it never does."""
+"""Tests of the follow planner: missing inputs, blocked paths, and safety."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OPEN = np.full(LASER.rays, np.inf)
 
 
 def walk(mute: Callable[[float], str], seconds: float) -> list[FollowSample]:
-    """Behind a person at 0.8 m/s along a wall; `mute` says at each time what is not heard."""
+    """Follow a person at 0.8 m/s along a wall; `mute` names the missing inputs at each time."""
     stage = FollowSimulation(
         FollowScene(WALL, [Walker([[0.0, 0.0], [30.0, 0.0]], 0.8)], seconds), 0, LegDetector()
     )
@@ -46,7 +46,7 @@ def test_the_same_seed_walks_the_same_way() -> None:
 
 
 class Bench:
-    """A planner that is told where the robot is, what it sees, and where the person is, all at once."""
+    """A planner that has received odometry, a scan and a person."""
 
     def __init__(self, **config: object) -> None:
         self.planner = FollowPlanner(FollowConfig(**{"laser_x": 0.0, **config}))  # type: ignore[arg-type]
@@ -82,9 +82,9 @@ def test_it_looks_around_once_where_the_person_was_lost_and_takes_up_again() -> 
     bench = Bench()
     bench.step((2.0, 1.0, 0.0, 0.0), seconds=0.5)
     plans = bench.step(None, seconds=12.0)
-    said = [plan.state for plan in plans]
-    assert State.LOOKING in said
-    assert said[-1] is State.LOST
+    states = [plan.state for plan in plans]
+    assert State.LOOKING in states
+    assert states[-1] is State.LOST
     assert not plans[-1].velocity.any()
     assert abs(bench.pose[2]) == pytest.approx(2.0 * np.pi, abs=1.0)
     (plan,) = bench.step((bench.pose[0] + 3.0, bench.pose[1], 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""Legs in single scans, of any scanner; what is no scan is refused."""
+"""Tests of leg detection in single scans of several scanners; malformed scans are refused."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_scans_without_a_reading_have_nobody(detector: LegDetector) -> None:
 
 
 @pytest.mark.parametrize(
-    ("ranges", "angle_min", "angle_increment", "said"),
+    ("ranges", "angle_min", "angle_increment", "message"),
     [
         (np.ones((2, 90)), 0.0, 0.01, r"ranges has the shape \(2, 90\), expected \(rays,\)"),
         ([], 0.0, 0.01, "expected .* at least one ray"),
@@ -82,9 +82,9 @@ def test_scans_without_a_reading_have_nobody(detector: LegDetector) -> None:
     ],
 )
 def test_what_is_no_scan_is_refused(
-    detector: LegDetector, ranges: object, angle_min: float, angle_increment: float, said: str
+    detector: LegDetector, ranges: object, angle_min: float, angle_increment: float, message: str
 ) -> None:
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         detector.detect(ranges, angle_min, angle_increment)  # type: ignore[arg-type]
 
 

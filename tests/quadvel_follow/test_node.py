@@ -1,4 +1,4 @@
-"""The node over DDS: what it publishes of a person who walks, whom it takes for meant, and what it refuses."""
+"""Tests of the tracker node over DDS: published person, selection, refusals."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Bench:
             self._executor.spin_once(timeout_sec=0.05)
 
     def send(self, at: float, ranges: np.ndarray, robot: np.ndarray | None) -> None:
-        """A scan at `at` s, and the robot's pose before and after it; waits until the node has taken it."""
+        """Publish a scan at `at` s between two poses; wait until the node has processed it."""
         known = len(self.heard["person_tracker/markers"])
         for shift in (-0.01, 0.01):
             if robot is not None:
@@ -130,12 +130,12 @@ def feed(bench: Bench, robot: np.ndarray | None, seconds: float = 3.0, start: fl
 def test_a_person_before_a_turned_robot_is_published_in_the_frame_of_its_odometry(bench: Bench) -> None:
     person = feed(bench, np.array([5.0, 1.0, 2.0]))
     bench.wait(lambda: bench.heard["person"] and bench.heard["person"][-1].header.stamp.nanosec > 850_000_000)
-    told, moving = bench.heard["person"][-1], bench.heard["person/odometry"][-1]
-    assert (told.header.frame_id, moving.header.frame_id) == ("odom", "odom")
-    assert np.hypot(told.pose.position.x - person[0], told.pose.position.y - person[1]) < 0.2
-    assert told.header.stamp == moving.header.stamp
+    published, moving = bench.heard["person"][-1], bench.heard["person/odometry"][-1]
+    assert (published.header.frame_id, moving.header.frame_id) == ("odom", "odom")
+    assert np.hypot(published.pose.position.x - person[0], published.pose.position.y - person[1]) < 0.2
+    assert published.header.stamp == moving.header.stamp
     assert moving.twist.twist.linear.x == pytest.approx(1.2, abs=0.3)
-    heading = 2.0 * np.arctan2(told.pose.orientation.z, told.pose.orientation.w)
+    heading = 2.0 * np.arctan2(published.pose.orientation.z, published.pose.orientation.w)
     assert np.cos(heading - 2.0 - np.pi / 2) > 0.9
     covariance = np.reshape(moving.pose.covariance, (6, 6))
     assert 0.0 < covariance[0, 0] < 0.1

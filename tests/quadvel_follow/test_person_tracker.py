@@ -1,4 +1,4 @@
-"""Persons over time: who they are, how sure the tracker is, and what is taken for nobody."""
+"""Tests of tracking: identities, covariance, and static objects that are no people."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def track(tracker: PersonTracker, instants: Iterable[SceneScan], posed: bool = T
 def test_who_walks_is_confirmed_within_two_seconds_with_position_and_velocity(detector: LegDetector) -> None:
     scene = walk([[4.0, -2.0], [4.0, 3.0]], 4.0, speed=1.2)
     instants = list(scene.scans())
-    told = track(PersonTracker(detector=detector), instants)
-    confirmed = [[t for t in tracks if t.confirmed] for tracks in told]
+    tracks_by_scan = track(PersonTracker(detector=detector), instants)
+    confirmed = [[t for t in tracks if t.confirmed] for tracks in tracks_by_scan]
     assert {len(c) for c in confirmed[40:]} == {1}
     last = confirmed[-1][0]
     assert np.hypot(*(last.position - instants[-1].people[0])) < 0.15
@@ -63,9 +63,9 @@ def test_what_stands_about_is_nobody_from_a_robot_that_moves(detector: LegDetect
     scene = walk(
         [[2.5, -1.0], [2.5, 0.0]], 6.0, still=False, speed=1e-6
     )  # a person who only stands is none yet
-    told = track(PersonTracker(detector=detector), scene.scans(), posed)
-    assert any(told)
-    assert not any(t.confirmed for tracks in told for t in tracks)
+    tracks_by_scan = track(PersonTracker(detector=detector), scene.scans(), posed)
+    assert any(tracks_by_scan)
+    assert not any(t.confirmed for tracks in tracks_by_scan for t in tracks)
 
 
 def test_tracks_are_in_the_frame_of_the_pose_and_without_one_in_the_sensor_s(detector: LegDetector) -> None:
@@ -81,9 +81,9 @@ def test_tracks_are_in_the_frame_of_the_pose_and_without_one_in_the_sensor_s(det
 
 def test_who_was_confirmed_may_stand_still(detector: LegDetector) -> None:
     scene = walk([[3.0, -2.0], [3.0, 0.0]], 6.0, speed=1.2)
-    told = track(PersonTracker(detector=detector), scene.scans())
-    assert len({t.id for tracks in told for t in tracks if t.confirmed}) == 1
-    assert np.hypot(*told[-1][0].velocity) < 0.15
+    tracks_by_scan = track(PersonTracker(detector=detector), scene.scans())
+    assert len({t.id for tracks in tracks_by_scan for t in tracks if t.confirmed}) == 1
+    assert np.hypot(*tracks_by_scan[-1][0].velocity) < 0.15
 
 
 def test_who_leaves_is_forgotten(detector: LegDetector) -> None:
@@ -109,7 +109,7 @@ def test_refused_input_changes_nothing_and_is_named(detector: LegDetector) -> No
     tracker = PersonTracker(detector=detector)
     scan = (np.ones(90), 0.0, 0.01)
     tracker.update(1.0, *scan, sensor_pose=[0.0, 0.0, 0.0])
-    for wrong, said in (
+    for wrong, message in (
         ((1.0, *scan, [0, 0, 0]), "time is 1.0, expected a later one than that of the scan before, 1.0"),
         ((0.5, *scan, [0, 0, 0]), "time is 0.5, expected a later one"),
         ((np.nan, *scan, [0, 0, 0]), "time is nan, expected a finite time"),
@@ -118,7 +118,7 @@ def test_refused_input_changes_nothing_and_is_named(detector: LegDetector) -> No
         ((2.0, *scan, None), "sensor_pose is None, expected one as for the scans before"),
         ((2.0, np.ones((3, 3)), 0.0, 0.01, [0, 0, 0]), "ranges has the shape"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             tracker.update(*wrong)  # type: ignore[arg-type]
     tracker.update(1.1, *scan, sensor_pose=[0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match=r"acceleration is -1\.0, expected a finite number above 0"):

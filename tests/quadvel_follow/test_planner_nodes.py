@@ -1,4 +1,4 @@
-"""The planners' nodes over DDS: what they command a robot that follows a person, or walks a way, and when they fall silent."""
+"""Tests of the planner nodes over DDS: commands, and when they stop."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ STEP = 0.05  # s, between two messages
 
 
 class Peer:
-    """A robot that does not move, on the clock of this machine, and who hears what it is told."""
+    """A robot at rest on the system clock, and a receiver of its commands."""
 
     def __init__(self, kind: type[Any], arguments: list[str]) -> None:
         rclpy.init(args=["--ros-args", *arguments])

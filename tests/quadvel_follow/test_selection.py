@@ -1,4 +1,4 @@
-"""Who is meant, and where the sensor was."""
+"""Tests of the selection of a person, and of the sensor's pose."""
 
 from __future__ import annotations
 

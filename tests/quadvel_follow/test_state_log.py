@@ -1,4 +1,4 @@
-"""What is logged of states that last, and of states that do not."""
+"""Tests of log lines about lasting and short states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ways from files, and a robot that walks them."""
+"""Tests of trajectories from files and of their execution."""
 
 from __future__ import annotations
 

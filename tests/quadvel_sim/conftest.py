@@ -1,4 +1,4 @@
-"""The node as a process of its own, and a peer that hears and orders it."""
+"""Fixtures: the node in a separate process, and a peer that receives and commands it."""
 
 import signal
 import subprocess
@@ -61,7 +61,7 @@ class SimProcess:
         self.process.send_signal(signal.SIGINT)
 
     def end(self) -> tuple[int, str]:
-        """Exit status and what it said on stderr."""
+        """Return exit status and stderr."""
         _, text = self.process.communicate(timeout=40.0)
         return self.process.returncode, text
 

@@ -1,4 +1,4 @@
-"""What a bad network does to packets, and that it does the same again from the same seed."""
+"""Tests of the unreliable network: faults of packets, and reproducibility from a seed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulated board over real UDP on loopback, with the real driver's link on the other side."""
+"""Tests of the simulated board over UDP on loopback with the link of the real driver."""
 
 from __future__ import annotations
 

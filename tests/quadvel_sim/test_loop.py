@@ -1,4 +1,4 @@
-"""How simulated time follows real time, answers and orders; commands take effect when they are due."""
+"""Tests of simulated time: real time, answers and requests; commands take effect when due."""
 
 import threading
 import time
@@ -187,7 +187,7 @@ def test_lockstep_without_answer_stands_still_and_sends_its_state_again() -> Non
 
 
 def test_a_robot_whose_time_stands_still_says_so() -> None:
-    """Else nobody could tell it from one that has died."""
+    """Otherwise a waiting robot looks like a dead one."""
     bench = Bench("realtime", clock=time.monotonic, answer_timeout=5.0)
     with running(bench.loop):
         bench.loop.submit(command(1.0, 0))

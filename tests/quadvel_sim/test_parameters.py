@@ -1,4 +1,4 @@
-"""The node's parameters become the simulation that they name, or a sentence."""
+"""Tests of the node's parameters: the resulting simulation, and refused values."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The second plant: the same robot, to whom contacts and inertia happen otherwise."""
+"""Tests of the held-out plant: the same robot with other contacts and inertia."""
 
 from __future__ import annotations
 

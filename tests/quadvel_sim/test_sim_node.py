@@ -1,4 +1,4 @@
-"""The node over DDS: topics, lockstep, services, refusals, the end."""
+"""Tests of the node over DDS: topics, lockstep, services, refusals, shutdown."""
 
 import time
 from collections.abc import Callable
@@ -28,9 +28,7 @@ def test_lockstep_waits_for_answers_and_tells_the_time(start: Start, peer: Any) 
     start(mode="lockstep", keyframe="stand", answer_timeout=0.2)
     states = peer.heard["low_state"]
     peer.spin_until(lambda: len(states) >= 3)
-    assert {state.tick for state in states} == {
-        0
-    }  # nobody answers: time stands still, the state is sent again
+    assert {state.tick for state in states} == {0}  # no answer: time stands still, the state is sent again
     peer.spin_until(lambda: "waiting for the LowCmd that answers the last state" in peer.diagnosed()[0])
     states.clear()
     peer.answer = answer
@@ -52,7 +50,7 @@ def test_lockstep_waits_for_answers_and_tells_the_time(start: Start, peer: Any) 
     links = {transform.child_frame_id for message in peer.heard["/tf"] for transform in message.transforms}
     assert links == {
         name.removesuffix("_joint") for name in robot.JOINT_NAMES
-    }  # where the trunk is, the estimator says
+    }  # the estimator publishes the pose of the trunk
 
 
 def test_in_a_world_the_laser_scans_and_persons_are_told(start: Start, peer: Any) -> None:
@@ -65,7 +63,7 @@ def test_in_a_world_the_laser_scans_and_persons_are_told(start: Start, peer: Any
     assert scan.angle_max == pytest.approx(-scan.angle_min) == pytest.approx(np.radians(135.0))
     ranges = np.array(scan.ranges)
     assert ((ranges < scan.range_max) | np.isinf(ranges)).all()
-    assert ranges.min() == pytest.approx(1.25, abs=0.1)  # the walls beside the robot
+    assert ranges.min() == pytest.approx(1.25, abs=0.1)  # the walls next to the robot
     assert peer.diagnosed()[1]["touched"] == "nothing"
     people = peer.heard["ground_truth/persons"][-1]
     assert people.header.frame_id == "odom"
@@ -132,7 +130,7 @@ def test_a_reset_puts_the_robot_on_other_ground(start: Start, peer: Any) -> None
         True,
         "the robot is back in posture stand, on slope ground",
     )
-    peer.spin_until(lambda: states[-1].tick > tick + 20)  # time goes on
+    peer.spin_until(lambda: states[-1].tick > tick + 20)  # time continues
     odom = peer.heard["ground_truth/odom"]
     peer.spin_until(lambda: abs(odom[-1].pose.pose.orientation.y + np.sin(0.1)) < 0.02)  # uphill
     response = peer.call("reset", terrain="swamp")
@@ -185,7 +183,7 @@ def test_ctrl_c_ends_it_with_status_0_even_when_it_comes_twice(start: Start, pee
     simulation.interrupt()
     status, text = simulation.end()
     assert status == 0
-    # A slow start may have it say that nobody answers.
+    # After a slow start it may report missing answers.
     assert all(line.startswith(("[INFO]", "[WARN]")) for line in text.splitlines()), text
 
 

@@ -1,4 +1,4 @@
-"""The simulated robot against closed form: flight, pushes, drives, sensors, watchdog, reproducibility."""
+"""Tests of the simulated robot against closed forms: flight, pushes, drives, sensors, watchdog."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +20,7 @@ G = robot.GRAVITY
 
 
 def simulator(**fields: object) -> Simulator:
-    """Perfect sensors and, unless given otherwise, drives that answer at once and exactly."""
+    """Noise-free sensors and, by default, ideal drives."""
     defaults: dict[str, object] = {"noise": SensorNoise.none(), "actuator": ActuatorParameters.ideal()}
     return Simulator(SimulatorConfig(**{**defaults, **fields}))
 

@@ -1,4 +1,4 @@
-"""A robot held in the air: the trunk stays, the legs are free."""
+"""Tests of a suspended robot: the trunk rests, the legs are free."""
 
 from __future__ import annotations
 

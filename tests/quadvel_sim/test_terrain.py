@@ -1,4 +1,4 @@
-"""The ground as a function and as MuJoCo sees it are one; rough ground is what it says it is."""
+"""Tests of the ground: the function equals MuJoCo's geom, and rough ground has its parameters."""
 
 import mujoco
 import numpy as np

@@ -1,4 +1,4 @@
-"""A world as the robot meets it: what its laser sees, who walks, what it touches; and files that are refused."""
+"""Tests of worlds: laser, people, touches, and refused files."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_readings_have_the_faults_that_were_asked_for() -> None:
 
 
 def seen_of(seed: int, look: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Last scan, persons and the robot's state after 0.2 s in the corridor."""
+    """Return last scan, people and the robot's state after 0.2 s in the corridor."""
     simulator = Simulator(SimulatorConfig(world=World.load("corridor"), seed=seed))
     for _ in range(4):
         if look:

@@ -1,4 +1,4 @@
-"""Distance between the robot's outline and obstacle points in the plane, for many poses together."""
+"""Distance between the robot's outline and obstacle points in the plane, for batches of poses."""
 
 from __future__ import annotations
 

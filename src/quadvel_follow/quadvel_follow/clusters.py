@@ -139,7 +139,7 @@ def find_clusters(scan: Scan) -> Clusters:
     if rays.size == 0:
         return Clusters(np.zeros((0, 2)), np.zeros(0, np.intp), np.zeros(0), np.zeros(0))
     parted = _starts_cluster(scan, rays)
-    if scan.is_full_circle and parted.any():  # begin at a cut, that the ends of the scan are none
+    if scan.is_full_circle and parted.any():  # start at a gap, so that no cluster spans the ends
         begin = int(np.argmax(parted))
         rays, parted = np.r_[rays[begin:], rays[:begin] + scan.ranges.size], np.roll(parted, -begin)
     parted[0] = True

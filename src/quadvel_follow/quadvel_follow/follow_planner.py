@@ -193,13 +193,13 @@ class FollowPlanner:
         self._scan: _Received | None = None
         self._odometry: _Received | None = None
         self._person: _Received | None = None
-        self._deviation = 0.0  # m, of its position
+        self._deviation = 0.0  # m, standard deviation of its position
         self._refusal: _Received | None = None
         self._others: _Received | None = None
         self._command = np.zeros(3)
         self._rate = np.zeros(3)  # of the command
         self._last_step = -np.inf
-        self._last_progress = -np.inf  # s, when a way was found last
+        self._last_progress = -np.inf  # s
         self._lost_since = np.inf  # s, since when the person is lost
         self._turned_angle: float | None = None  # rad, since looking around began
 

@@ -114,16 +114,16 @@ class ScanHistory:
         Returns:
             Number of scans with an empty place, (n,), and with an occupied place, (n,).
         """
-        looks = [(scan, then) for made, scan, then in self._kept if time - made >= MIN_AGE_S]
-        if not looks:
+        older_scans = [(scan, then) for made, scan, then in self._kept if time - made >= MIN_AGE_S]
+        if not older_scans:
             return np.zeros(len(points)), np.zeros(len(points))
-        empty, taken = np.array([check_places(scan, to_sensor(points, then)) for scan, then in looks]).sum(
-            0, dtype=float
-        )
+        empty, occupied = np.array(
+            [check_places(scan, to_sensor(points, then)) for scan, then in older_scans]
+        ).sum(0, dtype=float)
         local = to_sensor(points, pose)
         distance, bearing = np.hypot(*local.T), np.arctan2(local[:, 1], local[:, 0])
         same = np.mean(
-            [np.abs(scan.range_at(bearing) - distance) < FIXED_RANGE_M for scan, _ in looks], axis=0
+            [np.abs(scan.range_at(bearing) - distance) < FIXED_RANGE_M for scan, _ in older_scans], axis=0
         )
         carried = same > CARRIED_SHARE
-        return np.where(carried, 0.0, empty), np.where(carried, float(len(looks)), taken)
+        return np.where(carried, 0.0, empty), np.where(carried, float(len(older_scans)), occupied)

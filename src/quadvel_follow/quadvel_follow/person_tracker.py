@@ -159,19 +159,37 @@ class _Legs:
         probability: Probability of a leg or pair.
         merged: Whether two legs touch.
         empty: Number of past scans that show the place empty.
-        taken: Number of past scans that show it occupied.
+        occupied: Number of past scans that show it occupied.
     """
 
     position: Array
     probability: Array
     merged: NDArray[np.bool_]
     empty: Array
-    taken: Array
+    occupied: Array
 
 
 @attrs.define
 class _Hypothesis:
-    """Object with legs. `state`: x, y (m), vx, vy (m/s); `belief`: mean probability of its legs."""
+    """Object with legs: a person, or something static.
+
+    Attributes:
+        id: Identity.
+        state: x, y in m, vx, vy in m/s, (4,).
+        covariance: Covariance of the state, (4, 4).
+        born: Time of the first scan with it, s.
+        seen: Time of the last scan with one of its legs, s.
+        origin: First position, (2,), m.
+        belief: Mean probability of its legs.
+        scans: Number of scans since it was first seen.
+        sightings: Number of scans in which it was seen.
+        confirmed: Whether it is a person.
+        surprise: Recent mean distance from the predicted position to the middle of its legs, m.
+        pairs: Recent share of scans with both legs.
+        empty: Evidence that its places were empty before it came or after it left.
+        occupied: Evidence that its places were occupied at those times.
+        trail: Recent times (s) and positions (2,) of its legs.
+    """
 
     id: int
     state: Array
@@ -180,14 +198,14 @@ class _Hypothesis:
     seen: float
     origin: Array
     belief: float
-    scans: int = 0  # since it began
+    scans: int = 0
     sightings: int = 1
     confirmed: bool = False
-    surprise: float = 0.1  # m, from where it was expected to the middle of its legs, of late
-    pairs: float = 0.5  # share of scans with both its legs, of late
-    empty: float = 0.0  # looks at its places that found them empty before it came or after it left
-    taken: float = 0.0  # looks that found something there
-    trail: deque[tuple[float, Array]] = attrs.field(factory=deque)  # when its legs were seen where
+    surprise: float = 0.1
+    pairs: float = 0.5
+    empty: float = 0.0
+    occupied: float = 0.0
+    trail: deque[tuple[float, Array]] = attrs.field(factory=deque)
 
     def correct(self, position: Array, variance: float) -> None:
         """Correct the Kalman filter by a position (2,) in m with a variance per axis in m^2.
@@ -202,14 +220,14 @@ class _Hypothesis:
     @property
     def moved(self) -> float:
         """Share of checks that found its places empty while it was elsewhere."""
-        return self.empty / (self.empty + self.taken + 2.0)
+        return self.empty / (self.empty + self.occupied + 2.0)
 
 
 def _is_leg_of(hypothesis: _Hypothesis, walker: _Hypothesis) -> bool:
     """Return whether it is the other leg of a person: nearby, newer, and at a free place."""
     return (
         walker.id < hypothesis.id
-        and hypothesis.taken <= hypothesis.empty
+        and hypothesis.occupied <= hypothesis.empty
         and bool(np.hypot(*(walker.state[:2] - hypothesis.state[:2])) < MAX_STRIDE_M)
     )
 
@@ -268,9 +286,9 @@ class PersonTracker:
         self._time, self._has_external_pose = time, sensor_pose is not None
         legs = self._find_legs(time, scan, pose)
         self._predict(time, dt, scan, pose)
-        theirs = self._assign(time, legs)
-        self._correct(time, dt, theirs, legs)
-        self._start_hypotheses(time, legs, theirs)
+        assignment = self._assign(time, legs)
+        self._correct(time, dt, assignment, legs)
+        self._start_hypotheses(time, legs, assignment)
         self._check_left_places(time, dt, scan, pose)
         self._confirm_and_prune(time, scan, pose)
         self._history.add(time, scan, pose)
@@ -310,8 +328,10 @@ class PersonTracker:
         found = self._detector.find_candidates(scan)
         likely = found.probability > self.config.possible
         position = to_frame(found.position[likely], pose)
-        empty, taken = self._history.count_evidence(time, position, pose)
-        return _Legs(position, found.probability[likely], found.width[likely] > MERGED_WIDTH_M, empty, taken)
+        empty, occupied = self._history.count_evidence(time, position, pose)
+        return _Legs(
+            position, found.probability[likely], found.width[likely] > MERGED_WIDTH_M, empty, occupied
+        )
 
     def _predict(self, time: float, dt: float, scan: Scan, pose: Array) -> None:
         """Predict all hypotheses; a hidden one does not move into space that is seen empty.
@@ -324,8 +344,8 @@ class PersonTracker:
         moved = states.copy()
         moved[:, :2] += dt * states[:, 2:]
         unseen = np.array([time - h.seen for h in self._hypotheses]) - dt > self.config.forgotten
-        stays = unseen & check_places(scan, to_sensor(moved[:, :2], pose), PERSON_OFFSETS_M)[0]
-        moved[stays, :2] = states[stays, :2]
+        is_blocked = unseen & check_places(scan, to_sensor(moved[:, :2], pose), PERSON_OFFSETS_M)[0]
+        moved[is_blocked, :2] = states[is_blocked, :2]
         transition = np.eye(4)
         transition[0, 2] = transition[1, 3] = dt
         noise = self.config.acceleration * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(2))
@@ -335,9 +355,9 @@ class PersonTracker:
 
     def _assign(self, time: float, legs: _Legs) -> list[list[int]]:
         """Return the legs (up to two) of each hypothesis by the assignment of lowest cost."""
-        theirs: list[list[int]] = [[] for _ in self._hypotheses]
-        if not theirs or not len(legs.position):
-            return theirs
+        assignment: list[list[int]] = [[] for _ in self._hypotheses]
+        if not assignment or not len(legs.position):
+            return assignment
         states = np.array([h.state[:2] for h in self._hypotheses])
         spread = np.array([h.covariance[:2, :2] for h in self._hypotheses])
         spread += self.config.one_leg**2 * np.eye(2)
@@ -356,8 +376,8 @@ class PersonTracker:
         rows, columns = linear_sum_assignment(np.hstack([twice, np.zeros((len(twice), len(twice)))]))
         for row, column in zip(rows, columns, strict=True):
             if column < len(legs.position) and twice[row, column] < 0.0:
-                theirs[row % len(theirs)].append(int(column))
-        return theirs
+                assignment[row % len(assignment)].append(int(column))
+        return assignment
 
     def _type_cost(self, legs: _Legs) -> Array:
         """Return the cost (hypotheses, legs) of their types, relative to an unassigned leg.
@@ -367,16 +387,16 @@ class PersonTracker:
         """
         confirmed = np.array([h.confirmed for h in self._hypotheses])
         walks = confirmed & np.array([np.hypot(*h.state[2:]) > WALKING_SPEED for h in self._hypotheses])
-        stands = ~confirmed & np.array([h.taken > h.empty + STANDING_EVIDENCE for h in self._hypotheses])
+        stands = ~confirmed & np.array([h.occupied > h.empty + STANDING_EVIDENCE for h in self._hypotheses])
         unlike = np.log((1.0 - legs.probability + PROBABILITY_ERROR) / (legs.probability + PROBABILITY_ERROR))
-        rested, came = (legs.taken > 0.0) & (legs.empty == 0.0), legs.empty > legs.taken
+        rested, came = (legs.occupied > 0.0) & (legs.empty == 0.0), legs.empty > legs.occupied
         cost: Array = np.where(confirmed[:, None], unlike - PERSON_BONUS, 0.0) - UNASSIGNED_COST
         return cost + MISMATCH_COST * (walks[:, None] & rested) + MISMATCH_COST * (stands[:, None] & came)
 
-    def _correct(self, time: float, dt: float, theirs: list[list[int]], legs: _Legs) -> None:
+    def _correct(self, time: float, dt: float, assignment: list[list[int]], legs: _Legs) -> None:
         """Correct each hypothesis by the middle of its legs and update its statistics."""
         recent = min(1.0, dt / RECENT_S)
-        for hypothesis, pair in zip(self._hypotheses, theirs, strict=True):
+        for hypothesis, pair in zip(self._hypotheses, assignment, strict=True):
             if not pair:
                 continue
             both = len(pair) == 2 or bool(legs.merged[pair[0]])
@@ -390,7 +410,7 @@ class PersonTracker:
             share = dt / (dt + min(time - hypothesis.born, EVIDENCE_TIME_S))
             hypothesis.belief += share * (float(legs.probability[pair].max()) - hypothesis.belief)
             hypothesis.empty += float(legs.empty[leg])
-            hypothesis.taken += float(legs.taken[leg])
+            hypothesis.occupied += float(legs.occupied[leg])
             hypothesis.seen = time
             hypothesis.sightings += 1
             hypothesis.trail.append((time, legs.position[leg]))
@@ -399,10 +419,10 @@ class PersonTracker:
         """Return the standard deviation of a measured position, m."""
         return self.config.both_legs if both else self.config.one_leg
 
-    def _start_hypotheses(self, time: float, legs: _Legs, theirs: list[list[int]]) -> None:
+    def _start_hypotheses(self, time: float, legs: _Legs, assignment: list[list[int]]) -> None:
         """Start hypotheses at unassigned legs; two legs next to each other start one."""
-        taken = {leg for pair in theirs for leg in pair}
-        left = [leg for leg in range(len(legs.position)) if leg not in taken]
+        assigned = {leg for pair in assignment for leg in pair}
+        left = [leg for leg in range(len(legs.position)) if leg not in assigned]
         while left:
             pair = [left.pop(0)]
             if left:
@@ -430,7 +450,7 @@ class PersonTracker:
         for hypothesis in self._hypotheses:
             hypothesis.scans += 1
             hypothesis.empty *= fading
-            hypothesis.taken *= fading
+            hypothesis.occupied *= fading
             while hypothesis.trail and time - hypothesis.trail[0][0] > MEMORY_S:
                 hypothesis.trail.popleft()
         left = [
@@ -441,10 +461,10 @@ class PersonTracker:
             if time - then >= MIN_AGE_S
         ]
         if left:
-            empty, taken = check_places(scan, to_sensor(np.array([place for _, place in left]), pose))
-            for (hypothesis, _), is_empty, is_taken in zip(left, empty, taken, strict=True):
+            empty, occupied = check_places(scan, to_sensor(np.array([place for _, place in left]), pose))
+            for (hypothesis, _), is_empty, is_occupied in zip(left, empty, occupied, strict=True):
                 hypothesis.empty += is_empty
-                hypothesis.taken += is_taken
+                hypothesis.occupied += is_occupied
 
     def _confirm_and_prune(self, time: float, scan: Scan, pose: Array) -> None:
         """Confirm people that have walked; remove lost hypotheses and second legs."""

@@ -16,8 +16,8 @@ class StateLog:
     def __init__(self) -> None:
         self._text, self._since = "", 0.0
         self._logged = ""
-        self._short_states: Counter[str] = Counter()  # texts since the last line, by how often they began
-        self._short_states_since = 0.0  # s, when the first of these came
+        self._short_states: Counter[str] = Counter()  # number of starts since the last line
+        self._short_states_since = 0.0  # s, start of the first of these
 
     def next_line(self, now: float, text: str) -> str:
         """Return the line that is due.

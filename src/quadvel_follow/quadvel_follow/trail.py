@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-POINT_SPACING_M = 0.15  # m, from one point to the next
+POINT_SPACING_M = 0.15
+"""Distance between two points."""
 MAX_LENGTH_M = 10.0  # m
 
 

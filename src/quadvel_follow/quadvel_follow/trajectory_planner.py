@@ -60,7 +60,7 @@ class TrajectoryPlanner(Node):
         self._follower = TrajectoryFollower(self._trajectory, settings.closed_loop)
         self._closed = settings.closed_loop
         self._pose: np.ndarray | None = None
-        self._odom_received_at = -np.inf  # s, when odometry came last
+        self._odom_received_at = -np.inf  # s
         self._started_at: float | None = None
         self._refusals = Refusals()
         self._velocity = self.create_publisher(Twist, "cmd_vel", 10)

@@ -78,7 +78,7 @@ class Board:
         self._clock = clock
         self._socket = _bind_socket(address)
         self._inbound, self._outbound = BadNetwork(network, 0), BadNetwork(network, 1)
-        self._lock = threading.Lock()  # around the outward network and the client
+        self._lock = threading.Lock()  # guards outbound network and client
         self._client: Address | None = None
         self._modes = np.full(JOINTS, MODE_DAMPING)  # of each motor, as last commanded
         self._last_heard = 0.0

@@ -111,9 +111,7 @@ class SimulationLoop:
         self._inbox: deque[tuple[float, JointCommand]] = deque()
         self._reset_tick = 0  # tick of the last reset
         self._answered = self._paused = self._stopped = False
-        self._answered_tick: int | None = (
-            None  # the newest that a command answered; None: nobody controls the robot
-        )
+        self._answered_tick: int | None = None  # newest answered tick; None: no controller
         self._waiting_since: float | None = None  # on the clock, for an answer, in real time
         self._waited = 0.0  # s, for an answer, in lockstep
         self._requested_steps = 0  # ms that a paused simulation still has to advance

@@ -29,7 +29,7 @@ COARSE_PERIOD_S = 0.5
 _HALF_ROBOT_LENGTH_M = 0.4  # of the centre line, ahead of and behind the trunk's origin
 _HIP_HEIGHT_M, _SHOULDER_HEIGHT_M, _HEAD_HEIGHT_M = 0.85, 1.45, 1.65  # m above the ground
 _TORSO_RADIUS_M, _HEAD_RADIUS_M = 0.14, 0.11  # m, radii
-_CLOTHES_RGBA = {True: (0.15, 0.65, 0.25, 1.0), False: (0.3, 0.4, 0.65, 1.0)}  # of who is led, of others
+_CLOTHES_RGBA = {True: (0.15, 0.65, 0.25, 1.0), False: (0.3, 0.4, 0.65, 1.0)}  # followed, others
 _SKIN_RGBA = (0.85, 0.7, 0.6, 1.0)
 _PARTS = ("body", "left", "right")
 
@@ -95,7 +95,7 @@ class _Actor:
     next_stop: int = 0
     next_speed: int = 0
     lap: int = 0
-    pending_time: float = 0.0  # s, by which it is behind the time
+    pending_time: float = 0.0  # s, not yet simulated
 
 
 class Persons:

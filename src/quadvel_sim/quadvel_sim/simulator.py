@@ -38,7 +38,7 @@ DT = 0.001
 _TICK_MODULUS = 2**32
 _PAYLOAD_RADIUS_M = 0.05  # the payload is a solid sphere: I = 2/5 m r^2
 _Array = NDArray[np.float64]
-# q, kp, kd, dq, tau, in the order of ActuatorModel.step
+# q, kp, kd, dq, tau: arguments of ActuatorModel.step
 _CommandArrays = tuple[_Array, _Array, _Array, _Array | float, _Array | float]
 
 
@@ -73,7 +73,7 @@ class _Push:
 
     body: int
     wrench: _Array  # (6,) force and torque, world
-    steps_left: int  # left
+    steps_left: int
 
 
 def build_model(config: SimulatorConfig) -> mujoco.MjModel:
@@ -118,10 +118,8 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
         model.geom(f"{leg}_foot").friction[0] = friction
     config.physics.apply(model)
     foot, own = model.geom(f"{robot.LEGS[0]}_foot"), model.geom_priority == SURFACE_PRIORITY
-    model.geom_solref[own], model.geom_condim[own] = (
-        foot.solref,
-        foot.condim,
-    )  # friction alone is a surface's own
+    # A surface differs from the feet in its friction only.
+    model.geom_solref[own], model.geom_condim[own] = foot.solref, foot.condim
     disable = mujoco.mjtDisableBit
     model.opt.disableflags |= disable.mjDSBL_AUTORESET  # a diverged run is an error, not a restart
     model.opt.disableflags |= disable.mjDSBL_ISLAND  # one island always; the search costs 10 %

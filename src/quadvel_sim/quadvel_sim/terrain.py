@@ -155,7 +155,7 @@ class Terrain:
         Args:
             spec: Model that is extended.
         """
-        # The robot's geoms collide with contype 1 alone.
+        # The robot's geoms collide with contype 1 only.
         common = {"name": GEOM_NAME, "contype": 1, "conaffinity": 0, "material": GEOM_NAME}
         if self.kind != "rough":
             spec.worldbody.add_geom(
