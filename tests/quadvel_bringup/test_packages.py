@@ -81,7 +81,7 @@ def imported(folder: Path) -> set[str]:
                 names.add(module)
             case ast.Call(func=ast.Name("import_module"), args=[ast.Constant(str(module)), *_]):
                 names.add(module)
-            case ast.Call(func=ast.Name("library"), args=[_, ast.Constant(str(module))]):  # of an extra
+            case ast.Call(func=ast.Name("import_reader"), args=[_, ast.Constant(str(module))]):  # of an extra
                 names.add(module)
             case ast.Call(func=ast.Name("import_module"), args=[ast.JoinedStr(), *_]):
                 computes = True
