@@ -41,7 +41,7 @@ def grid():
 
 def follow(grid, command, times, error=(0.0, 0.0), fell=False):
     for _ in range(times):
-        grid.note(np.array([[*command, 0.0]]), np.array([error]), np.array([fell]))
+        grid.record(np.array([[*command, 0.0]]), np.array([error]), np.array([fell]))
 
 
 def test_commands_begin_near_rest_and_lie_within_the_limits(grid):

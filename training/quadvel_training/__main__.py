@@ -335,7 +335,11 @@ def write_card(
 
 
 def main() -> None:
-    """Run the program; errors in files are printed in one sentence."""
+    """Run the program; errors in files are printed in one sentence.
+
+    Raises:
+        SystemExit: a recipe, checkpoint or other file is wrong or missing.
+    """
     torch.set_num_threads(env.available_cores())
     try:
         app()

@@ -233,8 +233,8 @@ class CommandGrid:
         Returns:
             Tensors, for `restore`.
         """
-        held = {"followed": self.followed, "success": self.success}
-        return {name: torch.from_numpy(array.copy()) for name, array in held.items()}
+        arrays = {"followed": self.followed, "success": self.success}
+        return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Resume from a checkpoint.

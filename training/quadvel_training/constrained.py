@@ -140,7 +140,7 @@ class ConstrainedRun:
         self.past = Past(self.env)
         self.teacher = dagger.Teacher(load(teacher), self.env, self.past) if teacher else None
         self.rewards = Table2(self.env, c.rewards)
-        self.judgement = CommandScorer(c.n)
+        self.scorer = CommandScorer(c.n)
         network = dagger.load_policy(start) if start else Recurrent(DEFAULT_OBSERVATION.size, 12)
         self.actor = Gaussian(network, 12, c.std).to(self.device)
         self.actor.log_std.requires_grad_(False)
@@ -306,10 +306,10 @@ class ConstrainedRun:
             row = (obs, critic_obs, standing, action, mean, reward, fell, late, alive.copy(), *label)
             for name, value in zip(names, row, strict=True):
                 keep[name].append(value)
-            self.judgement.advance(velocity_error(env, command), TICK_S)
-            self.judgement.finish(command, (fell | late | env.changed) & alive, fell)
+            self.scorer.advance(velocity_error(env, command), TICK_S)
+            self.scorer.finish(command, (fell | late | env.changed) & alive, fell)
             alive &= ~(fell | late)
-        self.judgement.report_to(self.grid)
+        self.scorer.report_to(self.grid)
         self.samples += c.length * c.n * parallel.size()
         rows = {name: np.array(value, dtype=np.float32) for name, value in keep.items()}
         rows |= {"noise": before, "spread": self._spread, "last_critic_obs": self._critic_obs()}
@@ -321,7 +321,7 @@ class ConstrainedRun:
         return rollout, seen
 
     def _figures(self, rows: dict[str, torch.Tensor], alive: np.ndarray) -> dict[str, float]:
-        """Return errors over a stride of robots that are up (m/s, rad/s) and falls per robot-minute."""
+        """Return errors over a stride of living robots (m/s, rad/s) and falls per robot-minute."""
         xy, wz = error_magnitudes(self.past.stride[alive])
         return {
             "reward": float(rows["reward"].mean()),
@@ -348,7 +348,7 @@ class ConstrainedRun:
         self.past.reset(over)
         if self.teacher:
             self.teacher.reset(over)
-        self.judgement.take(over)
+        self.scorer.take(over)
         self._noise = self._noise.copy()  # the rollout refers to the old array
         self._action[over] = self._noise[over] = 0.0
         self._state, self._mirrored = (

@@ -47,14 +47,15 @@ def available_cores() -> int:
 
 @attrs.frozen
 class CommandRange:
-    """Range of velocity commands: a box, or the paper's ellipsoid with a density that falls outwards.
+    """Range of velocity commands: a box, or the paper's ellipsoid.
+
+    In the ellipsoid the radius is drawn with a density proportional to itself.
 
     Attributes:
         vx: m/s, from and to.
         vy: m/s, either way.
         wz: rad/s, either way.
-        ellipsoid: draw from the ellipsoid within the box, with a radius drawn in proportion to
-            itself.
+        ellipsoid: draw from the ellipsoid within the box.
         curve: m/s^2, limit in curves as in `quadvel_policy.observation.CommandLimits`; None for no
             limit.
         stance: share of commands to stand.
@@ -332,15 +333,16 @@ class VelocityEnv:
         back = self.rng.random(n) < self.config.reversed
         back &= before[:, :3].any(axis=1) & self.commands.contains(-before[:, :3])
         self._goal[ids[back]] = np.where([True, True, True, False], -before, 0.0 * goal)[back]
-        led = self.rng.random(n) < self.config.ramped
-        self._ramp[ids] = np.where(led, slow * (quick / slow) ** self.rng.random(n), np.inf)
+        ramps = self.rng.random(n) < self.config.ramped
+        self._ramp[ids] = np.where(ramps, slow * (quick / slow) ** self.rng.random(n), np.inf)
         self._ramp_commands(ids)
         self._next_command[ids] = self.time[ids] + self.rng.uniform(*self.commands.hold, len(ids))
         self.changed[ids] = True
 
     def _ramp_commands(self, ids: np.ndarray | slice) -> None:
-        """Move commands a sample closer to what was drawn; the stance flag follows once the velocity
-        is 0.
+        """Move commands a sample closer to what was drawn.
+
+        The stance flag follows once the velocity is 0.
         """
         goal, command = self._goal[ids, :3], self.command[ids, :3]
         way = goal - command

@@ -100,7 +100,7 @@ class VelocityNetwork(Recurrent):
 
 
 def _quantity(x: torch.Tensor, name: str) -> torch.Tensor:
-    """Extract a quantity from the network input (..., 69), in its unit, as far as it was not clipped."""
+    """Extract a quantity from the network input (..., 69), in its unit, up to clipping."""
     start = 0
     for term in features.DEFAULT_LAYOUT.terms:
         if term.name == name:
@@ -170,8 +170,9 @@ class EstimatedWalks:
             kept[:, ids] = new.detach()
 
     def start_over(self, forget: float) -> None:
-        """Start new walks where one ended; some of the others lose their memory, as after a gap in the
-        stream.
+        """Start new walks where one ended; some of the others lose their memory.
+
+        The loss has the effect of a gap in the stream.
 
         Args:
             forget: share of these others.

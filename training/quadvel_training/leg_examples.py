@@ -109,7 +109,7 @@ def _empty(content: dict[str, Any], step: int, rng: np.random.Generator) -> Iter
 
 
 def _walking(content: dict[str, Any], step: int, rng: np.random.Generator) -> Iterator[Examples]:
-    """Yield examples of a file with people who walk: what moves and is nearer than the background."""
+    """Yield examples of a file with people who walk: what moves in front of the background."""
     ranges = np.where(np.isfinite(content["ranges"]), content["ranges"], 2.0 * content["range_max"])
     usual = np.quantile(ranges, 0.8, axis=0)
     angles = content["angle_min"] + content["angle_increment"] * np.arange(ranges.shape[1])
@@ -151,7 +151,9 @@ def _nearest(points: Array, others: Array) -> Array:
 
 
 def simulate_examples(scenes: int, rng: np.random.Generator) -> Examples:
-    """Simulate scans of rooms with people; each scene has another room and scanner, at ten instants.
+    """Simulate scans of rooms with people.
+
+    Each scene has another room and scanner, at ten instants.
 
     Args:
         scenes: number of scenes.

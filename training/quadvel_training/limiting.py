@@ -15,15 +15,15 @@ from quadvel_policy.policy_file import PolicyFile
 
 
 def limit_commands(policy: Path, limits: CommandLimits) -> None:
-    """Rewrite the limits in a policy file's metadata; the network and all other metadata stay as they are.
+    """Rewrite the command limits in a policy file's metadata; everything else stays.
 
     Args:
-        policy: the ONNX file, replaced as a whole or not at all.
-        limits: the new lowest and highest vx, vy (m/s), wz (rad/s), and the limit of curves (m/s^2).
+        policy: ONNX file, replaced atomically.
+        limits: new lowest and highest vx, vy (m/s) and wz (rad/s), and limit in curves (m/s^2).
 
     Raises:
-        ValueError: limits wider than those in the file, which the policy was not trained for.
-        NetworkFileError: no policy file.
+        ValueError: the limits are wider than those in the file, which the policy was trained for.
+        NetworkFileError: the file is no policy file.
     """
     metadata = PolicyFile(policy).metadata
     bounds = dict(zip(COMMAND_AXES, zip(limits.low, limits.high, strict=True), strict=True))
@@ -31,7 +31,8 @@ def limit_commands(policy: Path, limits: CommandLimits) -> None:
         least, most = metadata.command_limits[axis]
         if not least <= low <= 0.0 <= high <= most:
             raise ValueError(
-                f"{policy}: command_limits.{axis}: asked for {low:g} to {high:g}, expected a part of {least:g} to {most:g} with 0"
+                f"{policy}: command_limits.{axis}: found {low:g} to {high:g}, expected a range within "
+                f"{least:g} to {most:g} that contains 0"
             )
     narrowed = attrs.evolve(metadata, command_limits=bounds, curve_limit=limits.curve)
     model = read_network(policy)

@@ -24,7 +24,7 @@ from .networks import Gaussian, State, select
 LOG_RATIO_BOUND = 10.0  # bound of |log r|, far outside the clip range of PPO
 IMITATION_HUBER_DELTA = 0.5  # network's unit; labels of robots about to fall must not dominate
 QUIET_ROBOT_SHARE = 0.25  # share of the robots, the last ones, that explore little
-QUIET_NOISE_RATIO = 0.3  # their exploration relative to the others'; trains for no noise
+QUIET_NOISE_RATIO = 0.3  # their exploration relative to the others', so that noise is not relied on
 ADVANTAGE_BOUND = 10.0  # standard deviations; one fall must not dominate an update
 
 

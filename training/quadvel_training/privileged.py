@@ -135,7 +135,7 @@ class Past:
         self.paired += (paired - self.paired) * period / PAIRING_S
 
     def _advance_stances(self) -> None:
-        """Note where feet touch down and leave the ground; `down` is still that of the sample before."""
+        """Record where feet touch down and lift off; `down` is still that of the sample before."""
         contact, ahead = self.env.contact, self.env.foot_position[..., 0] - HIPS_AHEAD
         was_down = self.down > 0.0
         self._landed = np.where(contact & ~was_down, ahead, self._landed)
@@ -316,9 +316,9 @@ class CommandScorer:
         """
         ids = np.flatnonzero(over)
         error, judged = self.take(ids)
-        tells = (fell[ids] | (judged > 0.5 * TRANSIENT_S)) & (command[ids, 3] < 0.5)
-        if tells.any():
-            self._over.append((command[ids][tells], error[tells], fell[ids][tells]))
+        counts = (fell[ids] | (judged > 0.5 * TRANSIENT_S)) & (command[ids, 3] < 0.5)
+        if counts.any():
+            self._over.append((command[ids][counts], error[counts], fell[ids][counts]))
 
     def report_to(self, grid: CommandGrid) -> None:
         """Pass the scores of all processes since the last call to the command grid.
@@ -359,7 +359,7 @@ class PrivilegedRun:
         self.env = VelocityEnv(env_config, self.grid)
         self.past = Past(self.env)
         self.rewards = WalkingRewards(self.env, c.rewards)
-        self.judgement = CommandScorer(c.n)
+        self.scorer = CommandScorer(c.n)
         self.actor = Gaussian(Mlp(OBSERVATION_SIZE, 12), 12, c.std)
         self.critic = Mlp(OBSERVATION_SIZE + CRITIC_EXTRA_SIZE + GAIT_EXTRA_SIZE, 1)
         mirrors = (torch_mirror(mirror) for mirror in (MIRROR, symmetry.JOINTS))
@@ -449,7 +449,7 @@ class PrivilegedRun:
             self.env.reset(ids)
             self.past.reset(ids)
             self.rewards.reset(ids)
-            self.judgement.take(ids)
+            self.scorer.take(ids)
             self._actions[:, ids] = 0.0
 
     def _critic_obs(self, obs: np.ndarray) -> np.ndarray:
@@ -480,7 +480,7 @@ class PrivilegedRun:
             touched = self.past.air.copy()
             env.tick(env.stand_q + ACTION_SCALE * action)
             self.past.advance(command)
-            self.judgement.advance(velocity_error(env, command), SAMPLE_S)
+            self.scorer.advance(velocity_error(env, command), SAMPLE_S)
             parts = self.rewards.terms(command, self.past, touched, np.stack([action, *self._actions]))
             reward = self.rewards.total(parts, env.fallen)
             self._actions = np.concatenate([action[None], self._actions[:-1]])
@@ -495,9 +495,9 @@ class PrivilegedRun:
             walking += on_the_way.sum()
             lifted = (~env.contact[on_the_way]).mean(axis=1).sum()
             seen += [*errors, fell.mean(), env.broken.sum(), env.contact.mean(), lifted]
-            self.judgement.finish(command, fell | late | env.changed, fell)
+            self.scorer.finish(command, fell | late | env.changed, fell)
             self._start_over(np.flatnonzero(fell | late))
-        self.judgement.report_to(self.grid)
+        self.scorer.report_to(self.grid)
         airborne = float(np.mean(parallel.gather(seen[5] / max(walking, 1))))
         self._update_airborne_share(airborne)
         self.samples += c.length * c.n * parallel.size()

@@ -31,11 +31,11 @@ def limited_drives() -> ActuatorParameters:
 
 
 def rated_drives() -> ActuatorParameters:
-    """Actuators with the AlienGo's speed-torque curve: full torque up to about half the top speed,
-    none at it.
+    """Actuators with the AlienGo's speed-torque curve.
 
-    For each robot the stall torque is `RATED_STALL` times the torque limit, which clips it, and the
-    no-load speed is `RATED_SPEED` times the speed limit.
+    The full torque is available up to about half the top speed, none at it. For each robot the
+    stall torque is `RATED_STALL` times the torque limit, which clips it, and the no-load speed is
+    `RATED_SPEED` times the speed limit.
 
     Returns:
         The shipped actuator model with these curves.
@@ -154,7 +154,7 @@ class Randomisation:
 
     @classmethod
     def calm(cls) -> Randomisation:
-        """Return the nominal plant on ordinary ground, with noise of good sensors and without pushes.
+        """Return the nominal plant on ordinary ground, with good sensors and without pushes.
 
         Returns:
             Narrow ranges.

@@ -120,8 +120,9 @@ def train_estimator(config: EstimatorConfig, source: Path | None, policy: Path, 
 
 
 def train_all(out: Path, device: str) -> bool:
-    """Run all stages from random weights, with the recipes of the project; resumes where it was
-    stopped.
+    """Run all stages from random weights, with the recipes of the project.
+
+    It resumes where it was stopped.
 
     Args:
         out: folder for the run directories.

@@ -44,12 +44,19 @@ class DelayLine:
 
     @property
     def delay(self) -> NDArray[np.float64]:
-        """Delay in s, (..., 1). A copy is returned; assign anything that broadcasts to this shape."""
+        """Delay in s, (..., 1), as a copy; assign anything that broadcasts to this shape."""
         return self._delay.copy()
 
     @delay.setter
     def delay(self, seconds: ArrayLike) -> None:
-        """Set the delay and precompute the read positions."""
+        """Set the delay and precompute the read positions.
+
+        Args:
+            seconds: s, broadcast to (..., 1).
+
+        Raises:
+            ValueError: a delay is negative or above `MAX_DELAY_S`.
+        """
         lead = self._ring.shape[1:-1]
         delay = np.broadcast_to(np.asarray(seconds, dtype=float), (*lead, 1)).copy()
         if not np.all((delay >= 0.0) & (delay <= MAX_DELAY_S)):

@@ -130,7 +130,11 @@ class ActuatorModel:
 
     @input_delay.setter
     def input_delay(self, seconds: Values) -> None:
-        """Set the delay of commands, gains and the targets that effects see."""
+        """Set the delay of commands, gains and the targets that effects see.
+
+        Args:
+            seconds: s, broadcast to (..., 1), at most `delay.MAX_DELAY_S`.
+        """
         self._packets.delay = seconds
         self._gains.delay = seconds
         if self._effects is not None:
@@ -143,7 +147,11 @@ class ActuatorModel:
 
     @output_delay.setter
     def output_delay(self, seconds: Values) -> None:
-        """Set the delay of the torque."""
+        """Set the delay of the torque.
+
+        Args:
+            seconds: s, broadcast to (..., 1), at most `delay.MAX_DELAY_S`.
+        """
         self._torques.delay = seconds
 
     @property
@@ -153,7 +161,11 @@ class ActuatorModel:
 
     @kp_scale.setter
     def kp_scale(self, scale: Values) -> None:
-        """Set the ratio and update the gains in force."""
+        """Set the ratio and update the gains in force.
+
+        Args:
+            scale: ratio, broadcast to (..., J).
+        """
         self._kp_scale = np.broadcast_to(scale, self.shape).astype(float)
         self._update_gains()
 
@@ -164,7 +176,11 @@ class ActuatorModel:
 
     @kd_scale.setter
     def kd_scale(self, scale: Values) -> None:
-        """Set the ratio and update the gains in force."""
+        """Set the ratio and update the gains in force.
+
+        Args:
+            scale: ratio, broadcast to (..., J).
+        """
         self._kd_scale = np.broadcast_to(scale, self.shape).astype(float)
         self._update_gains()
 
@@ -175,7 +191,11 @@ class ActuatorModel:
 
     @noise_std.setter
     def noise_std(self, std: Values) -> None:
-        """Set the standard deviation of the torque noise."""
+        """Set the standard deviation of the torque noise.
+
+        Args:
+            std: N m, broadcast to (..., J).
+        """
         self._noise_std = np.broadcast_to(std, self.shape).astype(float)
         self._noisy = bool(self._noise_std.any())
 
@@ -316,7 +336,7 @@ class ActuatorModel:
         return torque
 
     def _push_command(self, q_des: Array, kp: Values, kd: Values, dq_des: Values, tau_ff: Values) -> None:
-        """Push the command packet into its delay line and, while gains change, the gains into theirs."""
+        """Push the command packet into its delay line and, while gains change, the gains."""
         self._note_gains(kp, kd)
         # Everything in tau* that does not depend on the joint state travels as one number:
         #     packet = kp_hat q_des + kd_hat dq_des + tau_ff
@@ -332,7 +352,7 @@ class ActuatorModel:
             self._effects.push_targets(q_des, dq_des, self._new if self._any_new else None)
 
     def _note_gains(self, kp: Values, kd: Values) -> None:
-        """Record the commanded gains; keep their history until a change has passed the longest delay."""
+        """Record the commanded gains; keep their history until a change has passed the delay."""
         if self._kp is None or self._kd is None:
             self._set_gains(kp, kd)
         elif not (_is_identical(kp, self._kp) and _is_identical(kd, self._kd)):
@@ -365,9 +385,7 @@ class ActuatorModel:
             self._kd_hat = self._kd_scale * self._kd
 
     def _pd_torque(self, q: Array, dq: Array, out: Array) -> None:
-        """Compute the torque of the drive, the bracket of Eq. 1, with effects, clipped to the torque
-        limit.
-        """
+        """Compute the clipped torque of the drive: the bracket of Eq. 1, with effects."""
         kp_hat, kd_hat = self._kp_hat, self._kd_hat
         if self._gain_age < self._gains.length:
             gains = self._gains.read()

@@ -230,7 +230,7 @@ class ActuatorParameters:
 
     @property
     def probable_pairs(self) -> tuple[DelayPair, ...]:
-        """Pairs that randomisation draws from: error below 1.5 times the least one (Section 3.1)."""
+        """Pairs for randomisation: error below 1.5 times the least one (Section 3.1)."""
         least = self.best_pair.mse
         return tuple(
             pair for pair in self.pairs if pair.mse < PROBABLE_ERROR_RATIO * least or pair.mse == least
@@ -258,7 +258,7 @@ class ActuatorParameters:
         return parameters
 
     def save(self, path: str | Path) -> None:
-        """Write the parameters as YAML with the units in comments; `load` reads them back unchanged.
+        """Write the parameters as YAML with units in comments; `load` is the inverse.
 
         Args:
             path: file to write.

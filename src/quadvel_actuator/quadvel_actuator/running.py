@@ -135,7 +135,7 @@ class _RunningEffect:
         self.values = self.law.canonical(self.values)
 
     def apply(self, x: Any, now: StepView, new: NDArray[np.bool_] | None) -> Any:
-        """Return the value that the effect makes of `x`; environments that are `new` start from rest."""
+        """Return the value in place of `x`; environments that are `new` start from rest."""
         law = self.law
         if isinstance(law, MemoryLaw):
             u = [getattr(now, name) for name in law.inputs]

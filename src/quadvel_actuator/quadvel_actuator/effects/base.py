@@ -222,8 +222,9 @@ class EffectLaw(ABC):
 
     @property
     def indistinguishable_forms(self) -> tuple[EffectLaw, ...]:
-        """Forms that no log distinguishes from this one; how far the parameters move between forms
-        widens their intervals.
+        """Forms that no log distinguishes from this one.
+
+        How far the parameters move between forms widens their intervals.
         """
         return ()
 
@@ -295,7 +296,7 @@ class EffectLaw(ABC):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Settings that differ from their defaults; `from_settings` builds the same form from them."""
+        """Settings that are not the default; `from_settings` builds the same form from them."""
         own = {field.name: (getattr(self, field.name), field.default) for field in attrs.fields(type(self))}
         return {name: value for name, (value, usual) in own.items() if value != usual}
 

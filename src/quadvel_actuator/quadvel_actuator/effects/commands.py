@@ -91,9 +91,7 @@ class CommandHold(ErrorLaw):
 
 @attrs.frozen(eq=False)
 class _RandomCommandLoss(MemoryLaw):
-    """Random loss: each new command is lost with the probability `share`, for all joints of a robot
-    together.
-    """
+    """Random loss of each new command with the probability `share`, for all joints together."""
 
     name = CommandHold.name
     stage = Stage.ERRORS

@@ -191,11 +191,11 @@ class Armature(AddedLaw):
 
 @attrs.frozen(eq=False)
 class TimestampSkew(ErrorLaw):
-    """Channel `q` or `dq` that reaches the drive `late` s later than its rows say; negative: earlier.
+    """Time skew: `q` or `dq` reaches the drive `late` s later than its rows say.
 
-    The command keeps its time, so a position that is early on some joints is no velocity that is
-    late there. In a running model a late channel is a delay of the measurement. An early one is a
-    fault of the log alone and is ignored.
+    It is earlier if `late` is negative. The command keeps its time, so a position that is early on
+    some joints is no velocity that is late there. In a running model a late channel is a delay of
+    the measurement. An early one is a fault of the log alone and is ignored.
 
     Attributes:
         channel: `dq` or `q`.

@@ -139,7 +139,7 @@ class Cogging(AddedLaw):
 
     @override
     def excited_joints(self, p: Params, s: View) -> Bools:
-        """Select joints that moved through a whole period: over a part of one, cogging is any curve."""
+        """Select joints that moved through a whole period; over less, cogging is any curve."""
         whole: Bools = np.ptp(s.q, axis=0) * p["n"] >= 2.0 * np.pi
         return whole
 

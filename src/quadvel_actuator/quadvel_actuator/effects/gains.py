@@ -1,4 +1,4 @@
-"""Gains that vary with torque sign, time, temperature or supply voltage; coupling between joints."""
+"""Gains that vary with torque sign, time, temperature or voltage; coupling between joints."""
 
 from __future__ import annotations
 
@@ -129,9 +129,10 @@ _ACTS_ON_GAIN: Any = property(lambda law: law.what == "gain")  # each drive has 
 
 @attrs.frozen(eq=False)
 class SupplySag(TorqueLaw):
-    """Gain or torque limit that falls with the supply voltage V, by the factor 1 - sag (1 - V / full).
+    """Gain or torque limit that falls with the supply voltage.
 
-    Without a logged voltage, `PowerSag` uses the power of the joints instead.
+    The factor is 1 - sag (1 - V / full). Without a logged voltage V, `PowerSag` uses the power of
+    the joints instead.
 
     Attributes:
         what: `gain` or `bound`.

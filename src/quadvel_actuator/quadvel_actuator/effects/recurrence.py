@@ -131,7 +131,7 @@ def rate_limit_series(torque: Any, age: Any, dt: Any, start: Any, rate: Any) -> 
 
 
 def _run_loop(loop: Callable[..., Any], rows: tuple[Any, ...], numbers: tuple[Any, ...]) -> Any:
-    """Broadcast rows and parameters, flatten leading axes, and run a compiled loop over the rows."""
+    """Broadcast rows and parameters, flatten leading axes, and run a loop over the rows."""
     numbers = tuple(map(np.atleast_2d, numbers))
     shape = np.broadcast_shapes(*map(np.shape, (*rows, *numbers)))
     out = np.empty(shape)
@@ -143,11 +143,10 @@ def _run_loop(loop: Callable[..., Any], rows: tuple[Any, ...], numbers: tuple[An
 
 @cache
 def _compiled_loops() -> dict[str, Callable[..., Any]]:
-    """Compile the loops at the first call after an installation, which takes seconds; Numba caches
-    them on disk.
+    """Compile the loops; Numba caches them on disk.
 
-    They are no universal functions: Numba keeps those in two files, which several compiling
-    processes corrupt.
+    The first call after an installation takes seconds. They are no universal functions: Numba keeps
+    those in two files, which several compiling processes corrupt.
     """
     import numba  # takes time and memory that a running model need not spend
     from numba.extending import register_jitable
