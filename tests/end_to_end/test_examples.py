@@ -74,7 +74,6 @@ LOGS = [  # of one leg each
 NODES = [
     Step("quadvel world campus --out out/campus.png"),
     Step("quadvel people --out out/people", more="--runs 1"),
-    Step("quadvel demo follow --tour --out out/tour", more="--world corridor --metres 3 --no-video"),
     Step("python -m quadvel_training --help"),
     Step("quadvel run sim_node --ros-args -p terrain:=rough", served=True),
     Step("quadvel run sim_node --ros-args -p world:=park", served=True),
@@ -90,6 +89,7 @@ NODES = [
 SESSIONS = {"robot": ROBOT, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
 
 LEFT_OUT = {
+    "quadvel demo follow --tour --out out/tour": "tests/end_to_end/test_follow_demo.py runs the demo",
     "quadvel following --out out/following": "minutes; tests/quadvel_follow/test_follow_planner.py walks on its stage",
     "quadvel people --scans FOLDER --out out/people": "real scans that are no part of this repository; "
     "tests/quadvel_follow takes them where they are",
@@ -247,7 +247,7 @@ def leg_log(seed: int, with_torque: bool) -> dict[str, np.ndarray]:
     return log
 
 
-@pytest.mark.parametrize("name", SESSIONS)
+@pytest.mark.parametrize("name", ["robot", "logs", "nodes", pytest.param("excite", marks=pytest.mark.long)])
 def test_the_examples_run(name: str, sandbox: Path) -> None:
     said: list[str] = []
     with ProcessGroup(lambda process, line: said.append(line)) as group:

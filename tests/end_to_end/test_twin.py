@@ -29,6 +29,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("twin") / "walk.mcap"
 
 
+@pytest.mark.long
 def test_a_plant_walks_and_its_recording_shows_that_the_stacks_model_lacks_something(recording: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, str(PLANTS / "slow_current.yaml"), str(recording)]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=400)

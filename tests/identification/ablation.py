@@ -66,12 +66,15 @@ SWITCHES: dict[str, dict[str, Any]] = {
     },
     "kurtosis": {"fitted_model.normality_p_values": lambda residual, rows: np.ones(residual.shape[1])},
     "clusters in motion": {"criterion.CLUSTER_MOTION_RAD": 0.0},
-    "averaged encoders": {"preparation._steadied": lambda found, _: (found, 0.0)},
-    "even clocks": {"preparation.jitters": lambda _: False},
+    "averaged encoders": {"preparation._choose_averaging": lambda found, _: (found, 0.0)},
+    "even clocks": {"preparation.has_jitter": lambda _: False},
     "sharp accelerations": {
-        "log_signals.smooth_part": lambda name, t, dq, slope, come: (slope, np.zeros((dq.shape[1],) * 2))
+        "log_signals.split_acceleration": lambda name, t, dq, slope, come: (
+            slope,
+            np.zeros((dq.shape[1],) * 2),
+        )
     },
-    "between rows": {"model.BETWEEN": 1, "signals.BETWEEN": 1},
+    "between rows": {"model.INSTANTS_PER_ROW": 1, "signals.INSTANTS_PER_ROW": 1},
     "losses at random": {"lost_commands._at_random": lambda *_: True},
     "longest delays": {
         "identify.longest_equivalent_delay": _identity,

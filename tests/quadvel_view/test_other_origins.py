@@ -52,7 +52,7 @@ def commands(folder: Path, recording: Path) -> dict[str, list[str]]:
     }
 
 
-@pytest.fixture(scope="module", params=["up", "view", "demo"])
+@pytest.fixture(scope="module", params=["up", "view", pytest.param("demo", marks=pytest.mark.long)])
 def running(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, walked: Path
 ) -> Iterator[Running]:

@@ -50,7 +50,7 @@ def test_commands_begin_near_rest_and_lie_within_the_limits(grid):
     grid.open[:] = grid.allowed
     limits = grid.config.limits()
     drawn = grid.draw(np.random.default_rng(0), 2000)
-    assert np.allclose([limits.held(one) for one in drawn[:, :3].tolist()], drawn[:, :3])
+    assert np.allclose([limits.clamp(one) for one in drawn[:, :3].tolist()], drawn[:, :3])
     assert drawn[:, 0].max() > 3.9
     assert drawn[:, 2].max() > 5.5
     assert (drawn[drawn[:, 3] == 1, :3] == 0).all()

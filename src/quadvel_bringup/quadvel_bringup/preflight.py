@@ -44,7 +44,7 @@ def _policy(settings: Any) -> object:
 NODE_CHECKS = {
     "sim_node": NodeCheck("quadvel_sim.parameters:SimParameters", lambda settings: settings.config()),
     "board": NodeCheck(
-        "quadvel_sim.parameters:BoardParameters", lambda settings: (settings.config(), settings.off())
+        "quadvel_sim.parameters:BoardParameters", lambda settings: (settings.config(), settings.calibration())
     ),
     "driver": NodeCheck(
         "quadvel_driver.parameters:DriverParameters", lambda settings: settings.load_calibration()

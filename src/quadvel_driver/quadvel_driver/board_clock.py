@@ -113,9 +113,7 @@ class BoardClock:
         self._unit_reference = self._count, arrival
 
     def _board_time(self, unit: float, arrival: float) -> BoardTime:
-        """Convert the counter to local time: t = unit * count + min(arrival - unit * count) over
-        OFFSET_WINDOW.
-        """
+        """Convert the counter to local time: t = unit * count + min(arrival - unit * count) over OFFSET_WINDOW."""
         assert self._count is not None
         time = unit * self._count
         offset = arrival - time

@@ -11,9 +11,7 @@ from . import wire
 
 
 class DryRun(socket.socket):
-    """Replacement for the link's socket that keeps the last packet, sends nothing and receives
-    nothing.
-    """
+    """Replacement for the link's socket that keeps the last packet, sends nothing and receives nothing."""
 
     def __init__(self) -> None:
         super().__init__(socket.AF_INET, socket.SOCK_DGRAM)  # not bound to a port

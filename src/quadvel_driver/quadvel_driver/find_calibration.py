@@ -149,9 +149,7 @@ def _leg_torque(q: Array, down: Array, leg: int) -> Array:
 
 
 def _leg_masses(q: Array, leg: str) -> tuple[tuple[list[Array], list[Array]], list[Array], list[float]]:
-    """Return joint positions and centres of mass (n, 3) m, joint axes (n, 3) and masses (kg) of a
-    leg, trunk frame.
-    """
+    """Return joint positions and centres of mass (n, 3) m, joint axes (n, 3) and masses (kg) of a leg, trunk frame."""
     position, rotation = np.zeros((len(q), 3)), np.broadcast_to(np.eye(3), (len(q), 3, 3))
     joints, centres, axes, masses = [], [], [], []
     for k, kind in enumerate(robot.KINDS):
@@ -178,9 +176,7 @@ def _rotation_about(angle: Array, axis: int) -> Array:
 
 
 def _joint_zeros(suspended: Samples, calibration: Calibration) -> tuple[Array, Array]:
-    """Return the encoder zeros and their standard errors, (12,) rad each, for the IMU tilt of
-    `calibration`.
-    """
+    """Return the encoder zeros and their standard errors, (12,) rad each, for the IMU tilt of `calibration`."""
     down = rotate(calibration.mounting, rotate_inverse(suspended.quaternion, -UP))
     legs = [_leg_zeros(suspended, down, leg, calibration.joint_zeros) for leg in range(4)]
     zeros, errors = np.array(legs).transpose(1, 0, 2).reshape(2, 12)
@@ -215,9 +211,7 @@ def _leg_zeros(suspended: Samples, down: Array, leg: int, start: Array) -> tuple
     )
 
     def residuals(x: Array) -> Array:
-        """Return the weighted residuals for zeros, torque scales, Coulomb and viscous friction,
-        (3,) each.
-        """
+        """Return the weighted residuals for zeros, torque scales, Coulomb and viscous friction, (3,) each."""
         zeros, scale, dry, viscous = x.reshape(4, 3)
         model = scale * _leg_torque(q - zeros, down, leg) + dry * np.sign(dq) + viscous * dq
         return np.concatenate(
@@ -236,9 +230,7 @@ def _leg_zeros(suspended: Samples, down: Array, leg: int, start: Array) -> tuple
 
 
 def _is_steady(dq: Array) -> NDArray[np.bool_]:
-    """Return the rows of joint speeds (n, 3) in which all joints move, and none reverses nearby,
-    (n,).
-    """
+    """Return the rows of joint speeds (n, 3) in which all joints move, and none reverses nearby, (n,)."""
     under_way = np.abs(dq) > MIN_MOVING_SPEED
     same = np.sign(dq[1:]) == np.sign(dq[:-1])
     steady: NDArray[np.bool_] = np.all(under_way, axis=1)

@@ -1,5 +1,4 @@
-"""Fuzzer of the packet decoders: `python -m quadvel_driver.fuzz --datagrams 10000000`. For
-developers.
+"""Fuzzer of the packet decoders: `python -m quadvel_driver.fuzz --datagrams 10000000`. For developers.
 
 A fuzzer chooses bytes, from which three kinds of datagrams are made: raw bytes, packets with
 changed bytes, and packets with changed bytes and a valid CRC, which reach the checks of the fields.

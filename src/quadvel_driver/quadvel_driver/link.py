@@ -1,5 +1,4 @@
-"""UDP link to the robot's board: sends commands without a gap and receives the newest state. No
-ROS.
+"""UDP link to the robot's board: sends commands without a gap and receives the newest state. No ROS.
 
 The link runs in its own thread (`run`). It sends each command immediately and repeats the last one
 every 2 ms, so a lost packet costs 2 ms. It sends damping if commands stop, if the operator stops
@@ -169,9 +168,7 @@ class UdpLink:
             self._socket.close()
 
     def serve(self) -> None:
-        """Receive pending datagrams and send if due; for callers with a clock of their own instead
-        of `run`.
-        """
+        """Receive pending datagrams and send if due; for callers with a clock of their own instead of `run`."""
         self._receive()
         self._send_if_due()
 
@@ -301,9 +298,7 @@ class UdpLink:
         return min(max(self._send_next - self._clock(), 0.0), SEND_PERIOD_S)
 
     def _send_if_due(self) -> None:
-        """Repeat the present command if SEND_PERIOD_S has passed; send damping without a fresh
-        command.
-        """
+        """Repeat the present command if SEND_PERIOD_S has passed; send damping without a fresh command."""
         with self._lock:
             if self._clock() < self._send_next:
                 return
@@ -374,8 +369,7 @@ network_errors: errors of the socket.
 
 
 def clamp_for_board(command: JointCommand) -> JointCommand:
-    """Clamp a command to the limits of the robot, and replace damping mode by a servo without
-    stiffness.
+    """Clamp a command to the limits of the robot, and replace damping mode by a servo without stiffness.
 
     The board does not define the damping of mode 0, so braking is sent as mode 10 with kp = 0 and
     the requested kd.
@@ -401,9 +395,7 @@ def clamp_for_board(command: JointCommand) -> JointCommand:
 
 
 def _check_plausible(robot: RobotState) -> None:
-    """Raise WireError if a well-formed state has no meaning, such as one of a board that has not
-    started.
-    """
+    """Raise WireError if a well-formed state has no meaning, such as one of a board that has not started."""
     if robot.tick == 0:
         raise WireError("state: tick is 0, expected a counter that runs: the board has not started")
     length = math.hypot(*robot.quaternion.tolist())

@@ -1,5 +1,4 @@
-"""Commands of the operator from the wireless remote: a velocity, button commands, and a latched
-stop. No ROS.
+"""Commands of the operator from the wireless remote: a velocity, button commands, and a latched stop. No ROS.
 
     B                      stop: the joints are damped until the stop is released
     L1 + R1 + start        release the stop

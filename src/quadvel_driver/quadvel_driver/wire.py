@@ -1,5 +1,4 @@
-"""Encoding and decoding of the packets of the AlienGo's board: commands (610 bytes) and states (771
-bytes).
+"""Encoding and decoding of the packets of the AlienGo's board: commands (610 bytes) and states (771 bytes).
 
 The formats are those of Unitree's SDK for the AlienGo from 3.2 to 3.8.4 (firmware 0.1.35 and
 newer). The functions convert bytes to plain records and back; `link` handles sockets and time.
@@ -115,8 +114,7 @@ LENGTH, CRC, CONTENT = "length", "CRC", "content"
 
 
 class WireError(ValueError):
-    """A packet must not be used, or a record cannot be sent; the text names the value found and
-    expected.
+    """A packet must not be used, or a record cannot be sent; the text names the value found and expected.
 
     Attributes:
         kind: LENGTH, CRC or CONTENT.
@@ -178,8 +176,7 @@ class BoardState:
 
 
 def crc(data: bytes) -> int:
-    """Compute the CRC of the board: CRC-32/MPEG-2 over little-endian 4-byte words, highest bit
-    first.
+    """Compute the CRC of the board: CRC-32/MPEG-2 over little-endian 4-byte words, highest bit first.
 
     Args:
         data: Whole words.
@@ -402,9 +399,7 @@ def _mode(modes: NDArray[np.uint8]) -> int:
 
 
 def _roll_pitch_yaw(quaternion: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Return the angles (rad) of rotations about z, y, x in this order; zeros for a zero
-    quaternion.
-    """
+    """Return the angles (rad) of rotations about z, y, x in this order; zeros for a zero quaternion."""
     length = math.hypot(*quaternion.tolist())
     w, x, y, z = (quaternion / length).tolist() if length > 0.0 else (1.0, 0.0, 0.0, 0.0)
     return (
@@ -427,9 +422,7 @@ def _remote_bytes(remote: Remote) -> np.void:
 
 
 def _remote(data: bytes) -> Remote:
-    """Decode the remote; non-finite sticks read as a remote that is off, as no state is refused for
-    them.
-    """
+    """Decode the remote; non-finite sticks read as a remote that is off, as no state is refused for them."""
     fields = np.frombuffer(data, _REMOTE)[0]
     sticks = {stick: float(fields[stick]) for stick in ("lx", "ly", "rx", "ry")}
     if not np.isfinite(list(sticks.values())).all():

@@ -93,9 +93,7 @@ class EstimatorParameters(Scheduling):
 
 
 class EstimatorNode(Node):
-    """Publishes an estimate from the callback of each state, before the next tick of the
-    controller.
-    """
+    """Publishes an estimate from the callback of each state, before the next tick of the controller."""
 
     def __init__(self) -> None:
         super().__init__("estimator")
@@ -160,9 +158,7 @@ class EstimatorNode(Node):
         self._velocity.publish(message)
 
     def _publish_odometry(self, stamp: Any, state: RobotState, estimate: Estimate) -> None:
-        """Publish x and y by dead reckoning and the orientation of the IMU; z is the height above
-        the lowest foot.
-        """
+        """Publish x and y by dead reckoning and the orientation of the IMU; z is the height above the lowest foot."""
         floor = footprint(state.q, state.quaternion)
         position = np.array([*estimate.position[:2], -rotate(state.quaternion, floor.position)[2]])
         variances = np.array([*estimate.position_deviation[:2] ** 2, HEIGHT_VARIANCE])
@@ -221,9 +217,7 @@ def _fill_twist(twist: Any, state: RobotState, estimate: Estimate) -> None:
 
 
 def _covariance(linear: NDArray[np.float64], angular_variance: float) -> NDArray[np.float64]:
-    """Return the 36 numbers of a 6 x 6 covariance, row by row: x, y, z and the rotations about
-    them.
-    """
+    """Return the 36 numbers of a 6 x 6 covariance, row by row: x, y, z and the rotations about them."""
     matrix = angular_variance * _ANGULAR
     matrix[:3, :3] = linear
     return matrix.ravel()

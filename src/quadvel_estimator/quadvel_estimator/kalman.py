@@ -178,9 +178,7 @@ class KalmanEstimator:
         return velocity, self._covariance[..., VELOCITY_ROW, VELOCITY_ROW, None, None] * np.eye(3)
 
     def _contact_trust(self, state: RobotState, rotation: Array, jacobians: Array) -> Array:
-        """Return the contact confidence of each foot, (..., 4): 0 in the air, 1 planted, linear in
-        the force.
-        """
+        """Return the contact confidence of each foot, (..., 4): 0 in the air, 1 planted, linear in the force."""
         if self.config.contact_source == "foot_force":
             force = np.asarray(state.foot_force)
         else:
@@ -204,8 +202,7 @@ class KalmanEstimator:
         self._covariance = transition @ self._covariance @ transition.T + noise
 
     def _foot_speed_variance(self, leg_velocity: Array, trust: Array) -> Array:
-        """Return the variance of each foot's unmodelled speed, (..., 4), (m/s)^2: swing, or slip on
-        the ground.
+        """Return the variance of each foot's unmodelled speed, (..., 4), (m/s)^2: swing, or slip on the ground.
 
         sigma^2 = P_vv + sigma_foot^2            (expected variance of v_leg - v)
         e = |v_leg - v|^2 / (3 gate^2 sigma^2)   (excess over the slip gate)

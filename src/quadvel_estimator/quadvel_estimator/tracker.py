@@ -130,9 +130,7 @@ class VelocityTracker:
         return Estimate(velocity, covariance, self._position, self._deviation)
 
     def _check_order(self, time: float) -> None:
-        """Accept `time` (s) as the newest, refuse an older state, or reset the estimator after a
-        gap.
-        """
+        """Accept `time` (s) as the newest, refuse an older state, or reset the estimator after a gap."""
         if self._newest is not None and time <= self._newest:
             self._refused_in_order = self._refused_in_order + 1 if time > self._last_refused else 1
             self._last_refused = time

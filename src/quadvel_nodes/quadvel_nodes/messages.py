@@ -1,5 +1,4 @@
-"""Conversion of quadvel_msgs messages to the records of `quadvel_description.state`, with
-validation.
+"""Conversion of quadvel_msgs messages to the records of `quadvel_description.state`, with validation.
 
 The functions use the fields of a message without importing its class. Generated message classes
 check no values, so every node reads its inputs with these functions.

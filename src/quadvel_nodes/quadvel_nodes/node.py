@@ -145,8 +145,7 @@ def _start(make_node: Callable[[], Node], args: list[str] | None) -> Node:
 
 
 def _serve(node: Node, signals: socket, waker: socket) -> None:
-    """Run callbacks until a byte from `signals`, a call of `request_exit`, or the context's
-    shutdown.
+    """Run callbacks until a byte from `signals`, a call of `request_exit`, or the context's shutdown.
 
     An EventsExecutor that is still alive when the interpreter exits crashes it, so this function
     shuts its executor down.
@@ -178,8 +177,7 @@ def _serve(node: Node, signals: socket, waker: socket) -> None:
 
 
 def _executor() -> Any:
-    """Return an EventsExecutor where ROS 2 has one (Jazzy from April 2025 on), else the standard
-    one.
+    """Return an EventsExecutor where ROS 2 has one (Jazzy from April 2025 on), else the standard one.
 
     The standard executors iterate over all entities of a node, in Python, for each message
     (docs/decisions/0013), which is too slow for the control loop.

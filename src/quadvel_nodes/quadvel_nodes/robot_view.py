@@ -27,9 +27,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class RobotView:
-    """Publishes imu, joint_states, /tf, and once /tf_static and robot_description, on behalf of a
-    node.
-    """
+    """Publishes imu, joint_states, /tf, and once /tf_static and robot_description, on behalf of a node."""
 
     def __init__(
         self, node: Node, orientation: float, angular_velocity: float, linear_acceleration: float

@@ -67,8 +67,7 @@ class Scheduling:
             raise ValueError(f"cpus is {value!r}, expected some of {','.join(map(str, sorted(there)))}")
 
     def apply(self, warn: Callable[[str], object]) -> None:
-        """Apply the parameters to this process: cores and time slice to all threads, priority to
-        the caller's.
+        """Apply the parameters to this process: cores and time slice to all threads, priority to the caller's.
 
         The short time slice needs no privilege, and Linux 6.12; older kernels ignore it. Threads
         that start later inherit cores and slice, but not the priority. A real-time thread that

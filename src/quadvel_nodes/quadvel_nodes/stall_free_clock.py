@@ -1,5 +1,4 @@
-"""Time of the robot without stalls: stamps of states, minus the time in which a simulated robot
-stood still.
+"""Time of the robot without stalls: stamps of states, minus the time in which a simulated robot stood still.
 
 Stamps come from the clock of the machine, ticks from the clock of the robot. If the machine stalls
 together with its simulated robot, stamps advance but ticks do not: the next state follows the last
@@ -69,9 +68,7 @@ class StallFreeClock:
         return time
 
     def _exclude_stall(self, standstill: float, began: float) -> None:
-        """Leave out a standstill (s) that began at the stall-free time `began` (s), or extend the
-        last one.
-        """
+        """Leave out a standstill (s) that began at the stall-free time `began` (s), or extend the last one."""
         if began != self._stall_began:
             self._stalled_before, self._stall_began = self.stalled, began
         self.stalled += standstill

@@ -33,8 +33,7 @@ class TickGrid:
         )  # s from sample to sample in the mean, and how many it is the mean of
 
     def periods_due(self, stamp: float) -> int:
-        """Return how many periods have passed since the last answer, and count this sample as the
-        answer if any.
+        """Return how many periods have passed since the last answer, and count this sample as the answer if any.
 
         With period T, deadline d and mean spacing s of the samples, a sample at t is due if
         t >= d - min(s, T) / 2: the nearest sample to the deadline answers. Then the deadline moves

@@ -1,3 +1,1 @@
-"""The controller: observation and action, policy file, modes and safety, command mux, and the
-nodes.
-"""
+"""The controller: observation and action, policy file, modes and safety, command mux, and the nodes."""

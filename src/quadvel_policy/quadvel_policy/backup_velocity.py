@@ -52,8 +52,7 @@ class BackupVelocity:
         self.velocity: Array | None = None
 
     def update(self, state: RobotState) -> None:
-        """Process the next state; if the filter fails, reset it, without a velocity until the next
-        state.
+        """Process the next state; if the filter fails, reset it, without a velocity until the next state.
 
         Args:
             state: The measured state.

@@ -1,5 +1,4 @@
-"""Arbitration between velocity sources by priority, with limits on the rate of change. Knows no
-ROS.
+"""Arbitration between velocity sources by priority, with limits on the rate of change. Knows no ROS.
 
 The supervisor limits the command further to what the policy can follow.
 """

@@ -58,9 +58,7 @@ Stamped = tuple[float, Array]
 
 @attrs.frozen(kw_only=True)
 class ControlConfig(SupervisorConfig, Scheduling):
-    """Parameters of supervisor and scheduling, and age limits of the inputs; each field is a node
-    parameter.
-    """
+    """Parameters of supervisor and scheduling, and age limits of the inputs; each field is a node parameter."""
 
     max_velocity_age: float = setting(
         0.05,
@@ -92,8 +90,11 @@ class _LaggingNode:
         self._waiting_since = None
 
     def delays_robot(self, age: float, now: float) -> bool:
-        """Return whether the robot must wait, for the `age` of the newest message (s, stall-free)
-        at `now` (s, steady).
+        """Return whether the robot must wait for this node.
+
+        Args:
+            age: age of the newest message, s, stall-free.
+            now: steady clock, s.
         """
         if age <= self.max_lag:
             return False
@@ -254,9 +255,7 @@ class ControlLoop:
             self._tick(self.state, now)
 
     def _now(self, stamp: float = 0.0) -> float:
-        """Return the clock of the stamps, s, at least `stamp` in simulated time, which may arrive
-        late.
-        """
+        """Return the clock of the stamps, s, at least `stamp` in simulated time, which may arrive late."""
         before, now = self._steady(), self._clock()
         ahead = now - before
         if (
@@ -282,9 +281,7 @@ class ControlLoop:
         return any(last is not None and node.delays_robot(state.time - last[0], now) for last, node in known)
 
     def _answer_if_due(self, state: RobotState, now: float, start: float) -> None:
-        """Run a tick if the state is due; `now` and `start`: begin of the work on the clock and the
-        steady clock, s.
-        """
+        """Run a tick if the state is due; `now` and `start`: begin of the work on the clock and the steady clock, s."""
         self._waiting_state = None
         periods = self._grid.periods_due(state.time)
         if periods:
@@ -317,8 +314,7 @@ class ControlLoop:
 
 
 def _value_if_fresh(stamped: Stamped | None, now: float, limit: float, ahead: float = 0.0) -> Array | None:
-    """Return the value, or None if its time is more than `limit` (s) off, also into the future
-    after a clock step.
+    """Return the value, or None if its time is more than `limit` (s) off, also into the future after a clock step.
 
     Args:
         stamped: Time (s) and value.

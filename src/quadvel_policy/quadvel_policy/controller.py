@@ -233,9 +233,7 @@ class Controller(Node):
             log.warning(summary, throttle_duration_sec=QUIET)
 
     def _duplicate_publisher(self) -> str | None:
-        """Return a sentence if more than one node publishes states, which fit no single robot, else
-        None.
-        """
+        """Return a sentence if more than one node publishes states, which fit no single robot, else None."""
         count = self._states.get_publisher_count()
         return (
             f"low_state has {count} publishers, expected 1: stop the other simulator" if count > 1 else None

@@ -1,6 +1,4 @@
-"""Table of all faults, generated from the guards: `python -m quadvel_policy.faults` prints
-docs/faults.md.
-"""
+"""Table of all faults, generated from the guards: `python -m quadvel_policy.faults` prints docs/faults.md."""
 
 from __future__ import annotations
 

@@ -48,9 +48,7 @@ class Level(IntEnum):
 
 @attrs.frozen(kw_only=True)
 class GuardConfig:
-    """Limits of the guards; each field is a parameter of the node `controller`, with its
-    description and unit.
-    """
+    """Limits of the guards; each field is a parameter of the node `controller`, with its description and unit."""
 
     max_state_age: float = setting(
         0.05, "oldest state, and longest time without one, before a fault, s", at_most=FALL_TIME_S
@@ -115,9 +113,7 @@ class GuardConfig:
 
     @property
     def silence_limit(self) -> float:
-        """Longest time without a state, and largest age of the state, s; longer if the robot's time
-        may stand still.
-        """
+        """Longest time without a state, and largest age of the state, s; longer if the robot's time may stand still."""
         return self.max_standstill if self.robot_waits else self.max_state_age
 
 
@@ -175,9 +171,7 @@ class GuardInput:
 
     @cached_property
     def is_sound(self) -> bool:
-        """Whether all numbers are finite and all joints within their limits; one check for the
-        usual case.
-        """
+        """Whether all numbers are finite and all joints within their limits; one check for the usual case."""
         state, c = self.state, self.config
         low, high = LOWER - c.joint_margin, UPPER + c.joint_margin
         return bool(
@@ -188,8 +182,7 @@ class GuardInput:
 
 
 class Guard:
-    """Detects one kind of fault. The first paragraph of a guard's docstring is its row in
-    docs/faults.md.
+    """Detects one kind of fault. The first paragraph of a guard's docstring is its row in docs/faults.md.
 
     Attributes:
         level: Response to the fault.

@@ -191,9 +191,7 @@ class EncoderInconsistent(Guard):
 
 
 class EncoderFrozen(Guard):
-    """Angle and speed of a joint do not change a bit for `frozen_time`, while its target and other
-    joints move.
-    """
+    """Angle and speed of a joint do not change a bit for `frozen_time`, while its target and other joints move."""
 
     is_immediate = False
 
@@ -409,9 +407,7 @@ class FootForceFrozen(Guard):
 
 
 class Overruns(Guard):
-    """More than `max_overruns` consecutive deadlines were missed (on a robot; a simulated one
-    waits).
-    """
+    """More than `max_overruns` consecutive deadlines were missed (on a robot; a simulated one waits)."""
 
     level = Level.STANCE
 
@@ -530,8 +526,7 @@ def _estimate_problem(data: GuardInput) -> str | None:
 
 
 def _rotation_between(before: Array, after: Array) -> Array:
-    """Return the rotation vector of a small rotation between two orientations, (3,), rad, body
-    frame.
+    """Return the rotation vector of a small rotation between two orientations, (3,), rad, body frame.
 
     Twice the vector part of conj(before) * after; the sign selects the shorter rotation.
     """

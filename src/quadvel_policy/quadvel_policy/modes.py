@@ -151,8 +151,7 @@ class Damping:
 
 
 def vertical_offset(state: RobotState) -> Array:
-    """Compute how far the vertical through the trunk's origin is off the trunk's own axis, 1 m
-    below the origin.
+    """Compute how far the vertical through the trunk's origin is off the trunk's own axis, 1 m below the origin.
 
     Args:
         state: The measured state.
@@ -167,8 +166,7 @@ def vertical_offset(state: RobotState) -> Array:
 
 
 class Posture:
-    """Moves smoothly through postures and holds the last one, with the feet below the trunk on
-    slopes.
+    """Moves smoothly through postures and holds the last one, with the feet below the trunk on slopes.
 
     The feet are shifted uphill or downhill by the tilt of the trunk, which is low-pass filtered
     with LEAN_FILTER_S and limited to MAX_LEAN_RAD. The path starts at the targets for which the
@@ -249,17 +247,14 @@ class Posture:
         return JointCommand(q=q, dq=dq, kp=self._kp, kd=self._kd)
 
     def _lean_postures(self, lean: Array) -> Array:
-        """Return the postures of the path, (n, 12), rad, for an offset of the vertical
-        (`vertical_offset`).
-        """
+        """Return the postures of the path, (n, 12), rad, for an offset of the vertical (`vertical_offset`)."""
         feet = self._feet.copy()
         feet[..., :2] -= feet[..., 2:].mean(axis=1, keepdims=True) * lean
         leaning: Array = inverse_kinematics(feet) + self._offset
         return leaning
 
     def _interpolate(self, elapsed: float) -> tuple[Array, Array]:
-        """Interpolate the path with quintic polynomials: q (rad) and dq (rad/s), at rest at each
-        posture.
+        """Interpolate the path with quintic polynomials: q (rad) and dq (rad/s), at rest at each posture.
 
         q(s) = q_a + (10 s^3 - 15 s^4 + 6 s^5) (q_b - q_a),   dq = 30 s^2 (1 - s)^2 (q_b - q_a) / T
         """

@@ -107,9 +107,7 @@ def build_observation(
 
 
 class MetadataError(ValueError):
-    """Invalid metadata of a policy; the text names the field, the value found and the value
-    expected.
-    """
+    """Invalid metadata of a policy; the text names the field, the value found and the value expected."""
 
 
 def _metadata_error(field: str, found: object, expected: str) -> MetadataError:
@@ -240,8 +238,7 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
 
 @attrs.frozen(kw_only=True, eq=False)
 class PolicyMetadata:
-    """Everything needed to run a policy file: the JSON object under the ONNX metadata key
-    `quadvel`.
+    """Everything needed to run a policy file: the JSON object under the ONNX metadata key `quadvel`.
 
     Fields with one value per joint also accept one number for all joints.
 
@@ -401,8 +398,7 @@ class CommandLimits:
 
 
 class ActionMap:
-    """Conversion of the network's output to joint targets: target = offset + scale * clip(action),
-    rad.
+    """Conversion of the network's output to joint targets: target = offset + scale * clip(action), rad.
 
     `quadvel_description.command_range` defines how targets outside the command range are sent.
     """

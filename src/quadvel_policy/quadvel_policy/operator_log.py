@@ -55,9 +55,7 @@ class OperatorLog:
         return "; it stands until stance is requested" if self._supervisor.fault else ""
 
     def _new_findings(self) -> Iterator[tuple[bool, str]]:
-        """Yield findings that do not stop the robot, each again only after REPEAT_AFTER_S without
-        it.
-        """
+        """Yield findings that do not stop the robot, each again only after REPEAT_AFTER_S without it."""
         for finding in self._supervisor.findings:
             if finding.level > Level.LIMIT:
                 continue
@@ -67,8 +65,7 @@ class OperatorLog:
             self._last_seen[finding.name] = now
 
     def walk_refusals(self) -> Iterator[str]:
-        """Generate the reason why a standing robot does not follow a velocity, once per reason;
-        call it at 1 Hz.
+        """Generate the reason why a standing robot does not follow a velocity, once per reason; call it at 1 Hz.
 
         Yields:
             The sentence.

@@ -1,5 +1,4 @@
-"""Detection of stalls of this process, to distinguish them from a silent robot. Takes no time
-itself.
+"""Detection of stalls of this process, to distinguish them from a silent robot. Takes no time itself.
 
 After a stall of the machine, the newest known message is old, while newer ones wait to be read, or
 their sender has stalled, too. A process detects its own stall by a timer that fires late.

@@ -1,5 +1,4 @@
-"""Supervisor of the controller: transitions between modes, and responses to the faults that
-`guards` finds.
+"""Supervisor of the controller: transitions between modes, and responses to the faults that `guards` finds.
 
 Plain arrays and times in, joint commands out; it knows no ROS. `modes` implements the modes,
 `command_limits` limits the joint commands.
@@ -94,9 +93,7 @@ Transition = tuple[str, str] | None
 
 @attrs.frozen(kw_only=True)
 class SupervisorConfig(GuardConfig, JointCommandLimits):
-    """Gains and durations of the modes, limits of guards and commands; each field is a node
-    parameter.
-    """
+    """Gains and durations of the modes, limits of guards and commands; each field is a node parameter."""
 
     auto_stand: bool = setting(False, "stand up once, automatically, as soon as the robot reports")
     require_operator: bool = setting(False, "walk only after ~/enable_walking was called (set it on a robot)")
@@ -233,8 +230,7 @@ class Supervisor:
         return self._walking_enabled or not self.config.require_operator
 
     def enable_walking(self, enabled: bool) -> tuple[bool, str]:
-        """Allow or forbid walking; a walking robot that is forbidden to walk stands still on its
-        policy.
+        """Allow or forbid walking; a walking robot that is forbidden to walk stands still on its policy.
 
         The robot ignores a velocity that is commanded at that moment: a zero velocity must come
         first.
@@ -276,8 +272,7 @@ class Supervisor:
         return True, f"mode is {mode}"
 
     def fail(self, reason: str, fault: str) -> None:
-        """Latch damping until "passive" is requested, unless the joints are damped already; the
-        first reason stays.
+        """Latch damping until "passive" is requested, unless the joints are damped already; the first reason stays.
 
         Args:
             reason: One sentence.
@@ -383,8 +378,7 @@ class Supervisor:
                 self.command = STANCE_COMMAND.copy()
 
     def _select_velocity(self, guard_input: GuardInput) -> Array | None:
-        """Return the estimate, else the backup velocity; in walk without both, the decaying last
-        velocity.
+        """Return the estimate, else the backup velocity; in walk without both, the decaying last velocity.
 
         v' = v exp(-dt / VELOCITY_DECAY_S)
         """

@@ -202,7 +202,7 @@ def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[
         normality_p_values(residual, parts.all_rows),
     )
     coloured = p < WHITENESS_LEVEL
-    names = [name for _, one in o.term_effects for name in one.law.inputs]  # type: ignore[attr-defined]
+    names = [name for _, one in o.term_effects for name in one.law.input_signals]  # type: ignore[attr-defined]
     joints = (
         np.any([one.active for _, one in o.term_effects], axis=0) if names else np.zeros(len(coloured), bool)
     )
@@ -304,11 +304,11 @@ def _terms_entry(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
         "indistinguishable": [],
         "heldout_gain": sum(o.effects[k].gain for k, _ in ranked),
         "p_value": min(o.effects[k].p_value for k, _ in ranked),
-        "inputs": list(dict.fromkeys(name for _, effect in ranked for name in effect.law.inputs)),  # type: ignore[attr-defined]
+        "inputs": list(dict.fromkeys(name for _, effect in ranked for name in effect.law.input_signals)),  # type: ignore[attr-defined]
         "terms": [
             {
                 "kind": effect.law.shape.kind,  # type: ignore[attr-defined]
-                "inputs": list(effect.law.inputs),  # type: ignore[attr-defined]
+                "inputs": list(effect.law.input_signals),  # type: ignore[attr-defined]
                 "at": effect.law.at,
                 "joints": acting_joints(effect.active, joints),
                 "heldout_gain": o.effects[k].gain,

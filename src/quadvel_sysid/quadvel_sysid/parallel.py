@@ -53,8 +53,9 @@ def parallel_map(work: Callable[[int], Result], count: int, cores: int, samples:
     queue = _task_queue(count)
     workers = []
     try:
+        # One after the other, so that a failure finds those already started in the list.
         for _ in range(min(cores, count) - 1):
-            workers.append(_Worker(work, queue, samples))
+            workers.append(_Worker(work, queue, samples))  # noqa: PERF401
         found = {k: work(k) for k in _claim_tasks(queue)}
         for worker in workers:
             found |= worker.results()

@@ -101,7 +101,7 @@ class Search:
         """
         terms, _ = self._candidates_of(fitted).fitted_candidates(TERMS)
         best = min(terms, key=lambda one: one.criterion, default=None)
-        return () if best is None else best.last_effect.law.inputs  # type: ignore[attr-defined]
+        return () if best is None else best.last_effect.law.input_signals  # type: ignore[attr-defined]
 
     def prune(self, fitted: FittedModel) -> FittedModel:
         """Simplify a model: fewer effects and joints, special cases, shared values and gains.

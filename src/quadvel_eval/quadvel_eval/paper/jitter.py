@@ -36,8 +36,10 @@ class Jitter(Section):
         for policy in study.policies:
             top = command_limits(study, policy).high[0]
             for speed in (s for s in self.speeds if s <= top):
-                for seed in range(study.seeds):
-                    jobs.append(cell_job(study.setup(policy), (speed, 0.0, 0.0), seed, policy=policy))
+                jobs += [
+                    cell_job(study.setup(policy), (speed, 0.0, 0.0), seed, policy=policy)
+                    for seed in range(study.seeds)
+                ]
         return jobs
 
     @override
