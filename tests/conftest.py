@@ -64,8 +64,15 @@ if find_spec("hypothesis"):
     settings.register_profile("seeded", deadline=None, derandomize=True)
     settings.load_profile("seeded")
 
-# Folders whose tests start whole stacks of processes, which take more than a core: never two stacks at a time.
-STACKS = ("end_to_end", "quadvel_bringup", "quadvel_view")
+# Tests that start whole stacks of processes, which take more than a core: never two stacks at a time.
+STACKS = (
+    "end_to_end/",
+    "quadvel_view/",
+    *(
+        f"quadvel_bringup/test_{name}"
+        for name in ("excite.py", "listening", "operator", "recorder", "status", "stopped", "up")
+    ),
+)
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
@@ -74,8 +81,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     class Scheduling(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            folder = Path(nodeid.partition("::")[0]).parent.name
-            return "stacks" if folder in STACKS else super()._split_scope(nodeid)
+            file = nodeid.partition("::")[0]
+            return "stacks" if any(part in file for part in STACKS) else super()._split_scope(nodeid)
 
     return Scheduling(config, log) if config.getvalue("dist") == "loadfile" else None
 
