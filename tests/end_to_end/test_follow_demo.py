@@ -25,7 +25,10 @@ Array = NDArray[np.float64]
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("follow")
     command = [*QUADVEL, "demo", "follow", "--world", "campus", "--seconds", "10", "--out", str(out)]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=180)
+    for _ in range(2):  # in real time: once more if other tests left it too little of the machine
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=180)
+        if ended.returncode == 0 or "this machine is too slow" not in ended.stdout:
+            break
     assert ended.returncode == 0, ended.stdout + ended.stderr
     return out
 
