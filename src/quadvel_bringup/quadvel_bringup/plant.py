@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import attrs
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_description import robot
@@ -51,7 +52,7 @@ class HiddenPhysics(Protocol):
 
 
 @attrs.define
-class DryGear:
+class DryGear(HiddenPhysics):
     """Friction of a dry gear: the LuGre bristle model (Canudas de Wit et al., 1995).
 
     Attributes:
@@ -68,18 +69,8 @@ class DryGear:
     stiffness: float = 250.0
     memory: Array = attrs.Factory(lambda: np.zeros(12))
 
+    @override
     def torque(self, asked: Array, q: Array, dq: Array, dt: float) -> Array:
-        """Subtract the friction; see HiddenPhysics.torque.
-
-        Args:
-            asked: (12,) N m.
-            q: (12,) rad.
-            dq: (12,) rad/s.
-            dt: s.
-
-        Returns:
-            (12,) N m.
-        """
         # LuGre model with bristle deflection z and friction F = sigma_0 z:
         #     g(v) = F_c + (F_s - F_c) exp(-(v / v_s)^2),  dz/dt = v - sigma_0 |v| z / g(v)
         # The decay term is integrated implicitly, because it is stiff at high speed:
@@ -91,7 +82,7 @@ class DryGear:
 
 
 @attrs.define
-class SlowCurrent:
+class SlowCurrent(HiddenPhysics):
     """A slow current loop: proportional current control of a winding, with uncompensated back-EMF.
 
     Attributes:
@@ -104,18 +95,8 @@ class SlowCurrent:
     droop: Array
     memory: Array = attrs.Factory(lambda: np.full(12, np.nan))
 
+    @override
     def torque(self, asked: Array, q: Array, dq: Array, dt: float) -> Array:
-        """Return the mean torque of a first-order lag; see HiddenPhysics.torque.
-
-        Args:
-            asked: (12,) N m.
-            q: (12,) rad.
-            dq: (12,) rad/s.
-            dt: s.
-
-        Returns:
-            (12,) N m.
-        """
         # First-order lag towards tau_end = tau_asked - droop dq:
         #     tau(t) = tau_end + (tau_0 - tau_end) exp(-t / T)
         # The result is its mean over the step:
@@ -129,7 +110,7 @@ class SlowCurrent:
 
 
 @attrs.define
-class ChafingCable:
+class ChafingCable(HiddenPhysics):
     """Friction and a constant pull of a cable that chafes in a part of a joint's range.
 
     Attributes:
@@ -144,18 +125,8 @@ class ChafingCable:
     width: float = 0.08
     memory: Array = attrs.Factory(lambda: np.zeros(0))
 
+    @override
     def torque(self, asked: Array, q: Array, dq: Array, dt: float) -> Array:
-        """Subtract friction and pull in the contact range; see HiddenPhysics.torque.
-
-        Args:
-            asked: (12,) N m.
-            q: (12,) rad.
-            dq: (12,) rad/s.
-            dt: s.
-
-        Returns:
-            (12,) N m.
-        """
         # Contact share c(q) = (1 + tanh((q - q_0) / w)) / 2; tau = tau_asked - r c (0.4 + tanh(dq / 0.2)).
         touching = 0.5 * (1.0 + np.tanh((q - self.begin) / self.width))
         return asked - self.rub * touching * (0.4 + np.tanh(dq / 0.2))
