@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from quadvel_sysid import candidates, fit
+from quadvel_sysid.model.torque_model import fit
+from quadvel_sysid.search import candidates
 from tests.identification.ablation import BASELINE, SWITCHES, table, without
 
 

@@ -8,9 +8,17 @@ from simulated_joints import NAMES, parameters
 from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
 from quadvel_actuator.effects import MemoryLaw, Stage, registry
 from quadvel_actuator.effects.base import evaluate_distinct
+from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.logs.log import Log
-from quadvel_sysid.model import DELAY_STEP_S, AppliedEffect, Model, Unknowns, jacobian, pack, with_slots
-from quadvel_sysid.signals import Samples
+from quadvel_sysid.model.torque_model.torque_model import (
+    DELAY_STEP_S,
+    AppliedEffect,
+    Model,
+    Unknowns,
+    jacobian,
+    pack,
+    with_slots,
+)
 
 JOINTS = NAMES[:3]
 TRUTH = {

@@ -20,8 +20,8 @@ from quadvel_eval.paper.stance import Stance
 from quadvel_eval.paper.sustained import Sustained
 from quadvel_eval.paper.symmetry import Symmetry
 from quadvel_policy.policy_file import SHIPPED_POLICY
-from quadvel_sysid.eam import fit_eam
-from quadvel_sysid.signals import Samples
+from quadvel_sysid.data.plain_model import fit_eam
+from quadvel_sysid.data.signals import Samples
 
 ONE = Study(seeds=1)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from quadvel_sysid.acceleration import local_slope, split_acceleration
+from quadvel_sysid.data.acceleration import local_slope, split_acceleration
 
 
 def _stamps(rng, count=2000):

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quadvel_sysid.baselines import baseline_errors, explained_share, torque_variance
 from quadvel_sysid.cli import error_line
 from quadvel_sysid.logs.read_log import read_log
-from quadvel_sysid.sanity_checks import contradictions
+from quadvel_sysid.report.sanity_checks import contradictions
+from quadvel_sysid.statistics.baselines import baseline_errors, explained_share, torque_variance
 
 sys.path.insert(0, str(Path(__file__).parent))
 from servo_logs import recorded

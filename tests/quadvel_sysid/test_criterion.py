@@ -5,17 +5,17 @@ import numpy as np
 import pytest
 from simulated_joints import parameters, record
 
-from quadvel_sysid.criterion import (
+from quadvel_sysid.data.noise import noise_variance
+from quadvel_sysid.data.signals import Samples
+from quadvel_sysid.data.split import DataSplit, cluster_starts
+from quadvel_sysid.logs.log import Log
+from quadvel_sysid.statistics.criterion import (
     SIGNIFICANCE_LEVEL,
     WHITENESS_LEVEL,
-    DataSplit,
-    cluster_starts,
-    noise_variance,
+    compare_residuals,
     normality_p_values,
     whiteness_p_values,
 )
-from quadvel_sysid.logs.log import Log
-from quadvel_sysid.signals import Samples
 
 BEGIN, END = 2.0, 4.0  # s, of a stand
 
@@ -53,7 +53,9 @@ def test_a_disturbance_of_all_joints_counts_once() -> None:
     significant = 0
     for _ in range(400):
         before = slow() + rng.normal(size=(5000, 6))
-        significant += parts.compare(before, before - 0.05 * slow(), rows).p_value < SIGNIFICANCE_LEVEL
+        significant += (
+            compare_residuals(parts, before, before - 0.05 * slow(), rows).p_value < SIGNIFICANCE_LEVEL
+        )
     assert significant <= 12
 
 

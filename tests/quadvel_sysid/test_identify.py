@@ -8,12 +8,12 @@ import pytest
 from simulated_joints import NAMES, TABLE_4, parameters, record
 
 from quadvel_actuator import ActuatorParameters, Effect
-from quadvel_sysid.eam import fit_eam
-from quadvel_sysid.identification_data import prepare
+from quadvel_sysid.data.identification_data import prepare
+from quadvel_sysid.data.plain_model import fit_eam
+from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.dataset import Dataset
 from quadvel_sysid.logs.excerpts import cut_excerpts
-from quadvel_sysid.signals import Samples
 
 JOINTS = NAMES[:2]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadvel_sysid import interpolation
+from quadvel_sysid.data import interpolation
 
 RNG = np.random.default_rng(5)
 TIMES = np.cumsum(RNG.uniform(0.0005, 0.003, 400))

@@ -14,34 +14,39 @@ PAGE = Path(__file__).parents[2] / "docs" / "sysid.md"
 def _rows() -> list[list[str]]:
     modules, _, _ = PAGE.read_text().partition("## One log")
     cells = re.findall(r"^\| (`[^|]+) \|", modules, re.MULTILINE)
-    return [
-        [name.removesuffix(".py").strip("/") for name in re.findall(r"`([^`]+)`", cell)] for cell in cells
-    ]
+    return [[name.removesuffix(".py") for name in re.findall(r"`([^`]+)`", cell)] for cell in cells]
+
+
+def _name(path: Path) -> str:
+    """A module as the page writes it, or `logs/` for all of that folder."""
+    inside = path.relative_to(PACKAGE).with_suffix("").as_posix()
+    return "logs/" if inside.startswith("logs/") else inside
 
 
 def _imported(path: Path) -> set[str]:
-    """Modules and folders of the package that a file imports."""
-    level = len(path.relative_to(PACKAGE).parts)
-    nodes = [one for one in ast.walk(ast.parse(path.read_text())) if isinstance(one, ast.ImportFrom)]
-    names = [(one.module or one.names[0].name).split(".")[0] for one in nodes if one.level == level]
-    return set(names)
+    """Modules of the package that a file imports."""
+    here = path.relative_to(PACKAGE).parts[:-1]
+    found = set()
+    for one in ast.walk(ast.parse(path.read_text())):
+        if isinstance(one, ast.ImportFrom) and 0 < one.level <= len(here) + 1:
+            folder = PACKAGE.joinpath(*here[: len(here) + 1 - one.level], *(one.module or "").split("."))
+            paths = [folder.with_suffix(".py")] if one.module else []
+            paths += [folder / f"{name.name}.py" for name in one.names]
+            found |= {_name(found) for found in paths if found.exists()}
+    return found
 
 
 def test_imports_go_downwards_in_the_list_of_modules() -> None:
-    rows = _rows()
-    place = {name: k for k, names in enumerate(rows) for name in names}
-    found = {p.relative_to(PACKAGE).parts[0].removesuffix(".py") for p in PACKAGE.rglob("*.py")} - {
-        "__init__"
-    }
-    assert found == set(place)
-    for path in PACKAGE.rglob("*.py"):
-        mine = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-        above = {name for name in _imported(path) if mine in place and place[name] < place[mine]}
+    place = {name: k for k, names in enumerate(_rows()) for name in names}
+    paths = [path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py"]
+    assert {_name(path) for path in paths} == set(place)
+    for path in paths:
+        above = {name for name in _imported(path) if place[name] < place[_name(path)]}
         assert not above, f"{path.name} imports {above}, which stand above it in {PAGE.name}"
 
 
 def test_the_tuned_constants_have_the_documented_values() -> None:
-    rows = re.findall(r"^\| `(\w+)\.(\w+)` \| ([\d.]+) \|", PAGE.read_text(), re.MULTILINE)
+    rows = re.findall(r"^\| `([\w.]+)\.(\w+)` \| ([\d.]+) \|", PAGE.read_text(), re.MULTILINE)
     assert len(rows) == 29
     for module, name, value in rows:
         assert getattr(import_module(f"quadvel_sysid.{module}"), name) == float(value), f"{module}.{name}"

@@ -6,8 +6,8 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
-from quadvel_sysid import library, lost_commands
 from quadvel_sysid.identify import identify
+from quadvel_sysid.search import library, lost_commands
 
 JOINTS = NAMES[:2]
 

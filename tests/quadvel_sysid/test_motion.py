@@ -13,10 +13,10 @@ from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.simulator import Simulator
+from quadvel_sysid.data.motion import imply_torque
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
-from quadvel_sysid.motion import imply_torque
 
 JOINTS = NAMES[:2]
 

@@ -11,9 +11,9 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
+from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.identify import identify
 from quadvel_sysid.parallel import parallel_map
-from quadvel_sysid.signals import Samples
 
 
 @pytest.fixture(scope="module")

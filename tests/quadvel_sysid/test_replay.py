@@ -6,9 +6,9 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import ActuatorParameters, Effect
+from quadvel_sysid.export.replay import STRETCH_S, Legs, replay_deviations, stretch_starts
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log, LogError
-from quadvel_sysid.replay import STRETCH_S, Legs, replay_deviations, stretch_starts
 
 CALF = ("FR_calf_joint",)
 IDEAL = attrs.evolve(ActuatorParameters.ideal(), torque_limit=45.0)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from quadvel_actuator import ActuatorParameters
-from quadvel_sysid.identification import Identification, Shape, Trace
+from quadvel_sysid.report.identification import Identification, Shape, Trace
 from quadvel_sysid.report.report import REPORT_FILES, write_report
 
 JOINTS = ["FR_hip_joint", "FR_thigh_joint", "FR_calf_joint"]

@@ -6,7 +6,7 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator.effects import registry
-from quadvel_sysid.signals import Samples, scattered_rows
+from quadvel_sysid.data.signals import Samples, scattered_rows
 
 JOINTS = NAMES[:2]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from quadvel_sysid.summary_text import summary_text
+from quadvel_sysid.report.summary_text import summary_text
 
 
 def report(*effects: tuple[str, float]) -> dict[str, Any]:

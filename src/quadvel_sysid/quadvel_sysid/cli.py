@@ -19,17 +19,17 @@ from typing_extensions import override
 
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .baselines import FILTER_SPAN_S
 from .logs.checks import Inspection
 from .logs.columns import ColumnMap
 from .logs.dataset import Dataset
 from .logs.read_log import read_log
 from .logs.recordings import Topics
 from .memory import keep_freed_arrays, return_large_arrays
+from .statistics.baselines import FILTER_SPAN_S
 
 if TYPE_CHECKING:
-    from .identification_data import IdentificationData
-    from .identification_data import Progress as ProgressCallback
+    from .data.identification_data import IdentificationData
+    from .data.identification_data import Progress as ProgressCallback
 
 MULTI_VALUE_OPTIONS = ("--holdout", "--joints")
 """Options that take several values after one name."""
@@ -231,7 +231,7 @@ def _load_data(
         data = Dataset.inspect_all(fitted, heldout, gains, lambda one: print_findings(one, messages))
         long = sum(log.q.size for log in data.logs) >= _LONG_LOG_VALUES
         # Imported here, so that errors in the files appear before the engine is loaded.
-        from .identification_data import prepare
+        from .data.identification_data import prepare
 
         return prepare(data, progress=on_progress), long
 

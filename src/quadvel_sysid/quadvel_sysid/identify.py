@@ -16,31 +16,33 @@ from numpy.typing import NDArray
 
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .baselines import baseline_errors
-from .confidence import intervals
-from .criterion import DataSplit, noise_variance
-from .delays import longest_equivalent_delay, quantised_delays
-from .eam import DRIVE_WINDOWS_S, pd_torque
-from .export_parameters import actuator_parameters
-from .fit import fit
-from .fitted_model import FittedModel, ModelEvaluator
-from .identification import Identification
-from .identification_data import MAX_TORQUE_VALUES, IdentificationData, Progress, prepare
-from .library import SignalTerm
+from .data.identification_data import MAX_TORQUE_VALUES, IdentificationData, Progress, prepare
+from .data.motion import STRETCH_S, Body, Replay, replay_errors
+from .data.noise import noise_variance
+from .data.plain_model import DRIVE_WINDOWS_S, pd_torque
+from .data.preparation import MIN_BLOCK_S, Preprocessed, preprocess
+from .data.signals import Array, Bools, Samples
+from .data.split import DataSplit
+from .export.export_parameters import actuator_parameters
+from .export.replay import EXPLANATION as LEG_TEXT
+from .export.replay import MIN_BLOCK_S as LEG_BLOCK
+from .export.replay import STRETCH_S as LEG_STRETCH
+from .export.replay import Legs
 from .logs.dataset import Dataset
 from .logs.log import Log, LogError
-from .lost_commands import reassign_losses
-from .model import Model
-from .motion import STRETCH_S, Body, Replay, replay_errors
-from .outcome import Outcome, SelectedEffect, build_identification
-from .preparation import MIN_BLOCK_S, Preprocessed, preprocess
-from .replay import EXPLANATION as LEG_TEXT
-from .replay import MIN_BLOCK_S as LEG_BLOCK
-from .replay import STRETCH_S as LEG_STRETCH
-from .replay import Legs
-from .sanity_checks import contradictions
-from .selection import Search
-from .signals import Array, Bools, Samples
+from .model.delays import longest_equivalent_delay, quantised_delays
+from .model.fit import fit
+from .model.torque_model import Model
+from .report.identification import Identification
+from .report.outcome import Outcome, SelectedEffect, build_identification
+from .report.sanity_checks import contradictions
+from .search.fitted_model import FittedModel, ModelEvaluator
+from .search.library import SignalTerm
+from .search.lost_commands import reassign_losses
+from .search.selection import Search
+from .statistics.baselines import baseline_errors
+from .statistics.confidence import intervals
+from .statistics.criterion import compare_residuals
 
 _SEARCH_VALUES, _MAX_SEARCH_STEP_S = 30_000, 0.002
 """Number of torque values that the search uses, and the maximum step of its rows, s.
@@ -232,7 +234,7 @@ def _outcome(
 def _heldout_gain(model: Model, index: int, parts: DataSplit) -> tuple[float, float]:
     """Error reduction (N^2 m^2) of an effect on the reported rows, and its p-value there."""
     without = fit(model.without_effect(index), parts.fit_or_select)
-    comparison = parts.compare(without.residual(), model.residual(), parts.report)
+    comparison = compare_residuals(parts, without.residual(), model.residual(), parts.report)
     return comparison.gain, comparison.p_value
 
 

@@ -15,8 +15,8 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
+from .data.signals import Samples
 from .memory import trim_heap
-from .signals import Samples
 
 Result = TypeVar("Result")
 PR_SET_PDEATHSIG = 1

@@ -47,7 +47,7 @@ DRIVE, JOINT = "drive", "joint"
 class View(Protocol):
     """Signals that an effect may use.
 
-    They come from rows of a log (`quadvel_sysid.signals.Signals`) or from one step of a running
+    They come from rows of a log (`quadvel_sysid.data.signals.Signals`) or from one step of a running
     model.
     """
 
@@ -213,7 +213,7 @@ class EffectLaw(ABC):
         """List the forms to try on a log.
 
         Args:
-            about: data of the log, a `quadvel_sysid.library.Context`.
+            about: data of the log, a `quadvel_sysid.search.library.Context`.
 
         Returns:
             Forms of the effect; empty where it cannot act.

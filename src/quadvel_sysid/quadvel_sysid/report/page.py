@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from ..excitation import propose
-from ..identification import Identification
-from ..summary_text import UNCORRELATED_TEXT
 from . import figures
 from .figures import short_joint_name
+from .identification import Identification
+from .summary_text import UNCORRELATED_TEXT
 
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --soft: #656d76; --paper: #ffffff; --card: #f5f7f9;

@@ -10,7 +10,7 @@ import json
 import tempfile
 from pathlib import Path
 
-from ..identification import Identification
+from .identification import Identification
 from .page import report_page
 
 REPORT_FILES = ("report.html", "report.json", "actuator.yaml")

@@ -15,12 +15,12 @@ import numpy as np
 
 from quadvel_actuator.effects import EffectLaw
 
+from ..data.signals import Array
+from ..model.torque_model import AppliedEffect, Model
+from ..statistics.criterion import MIN_EFFECT_SIZE, SIGNIFICANCE_LEVEL
 from .candidates import LAWS, TERMS, Candidates, candidate_key
-from .criterion import MIN_EFFECT_SIZE, SIGNIFICANCE_LEVEL
 from .fitted_model import FittedModel, ModelEvaluator, joint_groupings
 from .library import SignalTerm
-from .model import AppliedEffect, Model
-from .signals import Array
 
 MAX_EFFECTS = 5
 """Maximum number of effects of one log."""

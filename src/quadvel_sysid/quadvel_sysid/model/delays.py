@@ -11,9 +11,9 @@ from functools import cache
 import attrs
 import numpy as np
 
+from ..data.signals import Array, Bools
 from .fit import fit, squared_error
-from .model import MAX_DELAYS_S, Model
-from .signals import Array, Bools
+from .torque_model import MAX_DELAYS_S, Model
 
 DRIVE_STEP_S = 0.001
 """Clock period of a drive, s, and of models that run with the identified parameters."""

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .eam import MAX_INPUT_DELAY_S
-from .logs.log import Log, LogError
+from ..logs.log import Log, LogError
+from .plain_model import MAX_INPUT_DELAY_S
 from .signals import Array, Bools, Samples
 
 STRETCH_S = 0.05

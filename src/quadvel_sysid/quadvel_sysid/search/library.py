@@ -33,10 +33,10 @@ from quadvel_actuator.effects.terms import (
 )
 from quadvel_actuator.running import ACCELERATION_WINDOW_S
 
-from .criterion import DataSplit
+from ..data.signals import Array, Bools, Signals
+from ..data.split import DataSplit
+from ..model.torque_model import AppliedEffect, Model
 from .lost_commands import lost_commands
-from .model import AppliedEffect, Model
-from .signals import Array, Bools, Signals
 
 _CACHE_SIZE = 12
 """Number of cached sets of regressors."""

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..logs.log import TIME_TOLERANCE_S, Log
 from . import interpolation
 from .acceleration import HALF_WIDTHS_S, local_lines, local_slope, split_acceleration
-from .logs.log import TIME_TOLERANCE_S, Log
 
 Array = NDArray[np.float64]
 Joints = slice | list[int]

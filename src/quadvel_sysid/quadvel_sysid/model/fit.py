@@ -15,9 +15,9 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from .model import MAX_DELAYS_S, Model, Unknowns, jacobian, pack, with_slots
-from .parallel import parallel_map
-from .signals import Array, Bools
+from ..data.signals import Array, Bools
+from ..parallel import parallel_map
+from .torque_model import MAX_DELAYS_S, Model, Unknowns, jacobian, pack, with_slots
 
 _CONVERGED = 2e-5
 """Relative reduction of the error below which a fit has converged."""

@@ -8,20 +8,21 @@ from functools import cached_property
 import attrs
 import numpy as np
 
-from .criterion import (
+from ..data.signals import Array
+from ..data.split import DataSplit
+from ..model.fit import fit, fit_delay_profile
+from ..model.torque_model import AppliedEffect, Groups, Model
+from ..parallel import parallel_map
+from ..statistics.criterion import (
     PENALTY_PER_PARAMETER,
     SIGNIFICANCE_LEVEL,
     WHITENESS_LEVEL,
     Comparison,
-    DataSplit,
+    compare_residuals,
     normality_p_values,
     whiteness_p_values,
 )
-from .fit import fit, fit_delay_profile
 from .library import complexity
-from .model import AppliedEffect, Groups, Model
-from .parallel import parallel_map
-from .signals import Array
 
 _VARIANCE_FLOOR = 1e-12
 """Added to variances, N^2 m^2, for logs without noise."""
@@ -72,7 +73,9 @@ class FittedModel:
         Returns:
             Score test of the change from `before` to this model.
         """
-        return self.evaluator.parts.compare(before.residual, self.residual, self.evaluator.parts.select)
+        return compare_residuals(
+            self.evaluator.parts, before.residual, self.residual, self.evaluator.parts.select
+        )
 
     @cached_property
     def is_white(self) -> bool:

@@ -18,8 +18,8 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from ..logs.log import Log
 from .log_signals import ALL_JOINTS, Joints, LogSignals, as_double
-from .logs.log import Log
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

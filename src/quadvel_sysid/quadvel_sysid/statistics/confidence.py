@@ -12,11 +12,11 @@ import attrs
 import numpy as np
 from scipy import stats
 
-from .criterion import DataSplit
-from .delays import delay_flatness
-from .fit import fit, normal_equations, squared_error
-from .model import MAX_DELAYS_S, Model, Unknowns
-from .signals import Array, Bools
+from ..data.signals import Array, Bools
+from ..data.split import DataSplit
+from ..model.delays import delay_flatness
+from ..model.fit import fit, normal_equations, squared_error
+from ..model.torque_model import MAX_DELAYS_S, Model, Unknowns
 
 CONFIDENCE_LEVEL = 0.95
 """Coverage of the intervals."""

@@ -12,12 +12,12 @@ from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
 from quadvel_actuator.parameters import ActuatorParameters, DelayPair, Effect
 from quadvel_description.robot import JOINT_NAMES
 
-from .criterion import DataSplit
-from .delays import running_delays
-from .library import SignalTerm
-from .model import AppliedEffect, Model, linear_columns
-from .preparation import reference_gains
-from .signals import Array, Bools
+from ..data.preparation import reference_gains
+from ..data.signals import Array, Bools
+from ..data.split import DataSplit
+from ..model.delays import running_delays
+from ..model.torque_model import AppliedEffect, Model, linear_columns
+from ..search.library import SignalTerm
 
 
 def actuator_parameters(

@@ -11,10 +11,10 @@ import numpy as np
 from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .baselines import explained_share, torque_variance
-from .confidence import Intervals
-from .criterion import SIGNIFICANCE_LEVEL, WHITENESS_LEVEL, DataSplit, normality_p_values, whiteness_p_values
-from .export_parameters import (
+from ..data.preparation import reference_gains
+from ..data.signals import Array
+from ..data.split import DataSplit
+from ..export.export_parameters import (
     acting_joints,
     actuator_parameters,
     gain_deviations,
@@ -24,12 +24,13 @@ from .export_parameters import (
     torque_limits,
     value_and_interval,
 )
+from ..logs.findings import Finding as LogFinding
+from ..model.torque_model import AppliedEffect, Model
+from ..search.library import SignalTerm
+from ..statistics.baselines import explained_share, torque_variance
+from ..statistics.confidence import Intervals
+from ..statistics.criterion import SIGNIFICANCE_LEVEL, WHITENESS_LEVEL, normality_p_values, whiteness_p_values
 from .identification import Identification, Shape, Trace
-from .library import SignalTerm
-from .logs.findings import Finding as LogFinding
-from .model import AppliedEffect, Model
-from .preparation import reference_gains
-from .signals import Array
 from .summary_text import summary_text
 
 SCHEMA = 1

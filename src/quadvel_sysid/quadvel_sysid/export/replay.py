@@ -26,9 +26,9 @@ from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf
 
-from .log_signals import as_double
-from .logs.log import Log, LogError
-from .signals import Array, Bools
+from ..data.log_signals import as_double
+from ..data.signals import Array, Bools
+from ..logs.log import Log, LogError
 
 STRETCH_S = 0.2
 """s that are replayed from a measured state; then the next stretch begins at another measured state."""

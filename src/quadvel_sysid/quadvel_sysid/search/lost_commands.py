@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from quadvel_actuator.effects.commands import MAX_BACKLOG, CommandHold
 
-from .criterion import DataSplit
-from .fit import fit, squared_error
-from .model import AppliedEffect, Model
-from .signals import Array, Bools
+from ..data.signals import Array, Bools
+from ..data.split import DataSplit
+from ..model.fit import fit, squared_error
+from ..model.torque_model import AppliedEffect, Model
 
 SUSPICION_NATS = 6.0
 """nats of log likelihood by which a command looks lost or late on its own."""

@@ -11,14 +11,14 @@ import numpy as np
 
 from quadvel_actuator.effects import EffectLaw
 
+from ..data.signals import Bools
+from ..model.fit import fit, fit_near_delays
+from ..model.torque_model import Model
+from ..parallel import parallel_map
 from . import library
-from .fit import fit, fit_near_delays
 from .fitted_model import FittedModel
 from .library import Context, SignalTerm
-from .model import Model
-from .parallel import parallel_map
 from .screening import CandidateScreening, ScreenedCandidate, promising
-from .signals import Bools
 
 MAX_FITTED_LAWS, MAX_FITTED_TERMS = 6, 4
 """Laws, and regressors of named signals, that are fitted after a screening."""

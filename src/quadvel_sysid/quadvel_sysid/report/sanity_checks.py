@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from .baselines import FILTER_SPAN_S
+from ..statistics.baselines import FILTER_SPAN_S
 
 MAX_REPLAY_ERROR_RAD = 1.0
 """Replay error, rad, above which a replay is no evidence for the model."""

@@ -12,13 +12,14 @@ from collections.abc import Callable, Sequence
 import attrs
 import numpy as np
 
-from .criterion import DataSplit, cluster_starts, encoder_variance, noise_variance
-from .eam import Eam, fit_eam
+from ..logs.excerpts import has_jitter, restore_even_clock
+from ..logs.findings import Finding
+from ..logs.log import Log, LogError
 from .identification_data import IdentificationData
-from .logs.excerpts import has_jitter, restore_even_clock
-from .logs.findings import Finding
-from .logs.log import Log, LogError
+from .noise import encoder_variance, noise_variance
+from .plain_model import Eam, fit_eam
 from .signals import Samples
+from .split import DataSplit, cluster_starts
 
 _MIN_BLOCKS = 20
 """Blocks of a log, at least."""

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import attrs
 
-from .logs.dataset import Dataset
-from .logs.excerpts import cut_excerpts
-from .logs.findings import Finding
-from .logs.log import Log
+from ..logs.dataset import Dataset
+from ..logs.excerpts import cut_excerpts
+from ..logs.findings import Finding
+from ..logs.log import Log
 from .motion import Body, imply_torque
 
 Progress = Callable[[float, str], None]

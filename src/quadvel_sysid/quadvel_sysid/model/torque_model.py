@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from quadvel_actuator.effects import DRIVE, AddedLaw, EffectLaw, ErrorLaw, MemoryLaw, Stage
 from quadvel_actuator.effects.base import distinct_indices
 
-from .signals import INSTANTS_PER_ROW, Array, Bools, Samples, Signals
+from ..data.signals import INSTANTS_PER_ROW, Array, Bools, Samples, Signals
 
 Groups = NDArray[np.intp]
 

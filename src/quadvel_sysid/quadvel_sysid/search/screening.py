@@ -16,12 +16,12 @@ import numpy as np
 
 from quadvel_actuator.effects import EffectLaw, Stage
 
-from .criterion import PENALTY_PER_PARAMETER
-from .fit import RIDGE
+from ..data.signals import Array, scattered_rows
+from ..model.fit import RIDGE
+from ..model.torque_model import MAX_DELAYS_S, AppliedEffect, Model, Unknowns, jacobian, linear_columns
+from ..parallel import parallel_map
+from ..statistics.criterion import PENALTY_PER_PARAMETER
 from .library import Context, SignalTerm, allowed_joints, complexity
-from .model import MAX_DELAYS_S, AppliedEffect, Model, Unknowns, jacobian, linear_columns
-from .parallel import parallel_map
-from .signals import Array, scattered_rows
 
 _TOTAL_DELAY_CHANGES_S = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004, 0.006, 0.008)
 _NO_DELAY_CHANGES_S = (0.0,)

@@ -7,7 +7,7 @@ from typing import Any
 
 from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
 
-from .criterion import SIGNIFICANCE_LEVEL
+from ..statistics.criterion import SIGNIFICANCE_LEVEL
 
 UNCORRELATED_TEXT = "uncorrelated with every logged signal; the cause may be too rare in the training rows"
 """Statement about a structured residual without a correlated signal."""

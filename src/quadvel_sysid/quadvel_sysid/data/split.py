@@ -1,0 +1,101 @@
+"""Split of the samples into fitted, selection and reported rows, and into clusters.
+
+Residuals of neighbouring rows are correlated. Every test therefore uses sums over clusters of at
+least 0.1 s as its independent units (cluster-robust inference).
+"""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from .signals import Array, Bools, Samples
+
+CLUSTER_DURATION_S = 0.1
+"""Duration, s, over which sums of residuals count as independent."""
+CLUSTER_MOTION_RAD = 0.02
+"""Motion, rad, of some joint that ends a cluster: samples at rest are not independent."""
+
+
+@attrs.frozen(eq=False)
+class DataSplit:
+    """Split of the samples into fitted, selection and reported rows, and into clusters.
+
+    Attributes:
+        fit: Fitted samples, (N, J) bool.
+        select: Samples that select effects, (N, J) bool.
+        report: Samples that neither fit nor select, (N, J) bool; errors are reported on them.
+        cluster_starts: Row at which each cluster begins, (C,).
+        noise_overlap: Number of following rows that share the noise of a row's torque. It is above
+            0 for torques from accelerations, which are differences of speeds.
+    """
+
+    fit: Bools
+    select: Bools
+    report: Bools
+    cluster_starts: NDArray[np.intp]
+    noise_overlap: int = 0
+
+    @property
+    def all_rows(self) -> Bools:
+        """All samples of the three parts, (N, J) bool."""
+        return self.fit | self.select | self.report
+
+    @property
+    def fit_or_select(self) -> Bools:
+        """Samples that fit or select, (N, J) bool."""
+        return self.fit | self.select
+
+    def select_rows(self, rows: NDArray[np.intp]) -> DataSplit:
+        """Restrict the split to a subset of rows.
+
+        Args:
+            rows: Ascending row numbers, (n,).
+
+        Returns:
+            The split of these rows.
+        """
+        starts = np.unique(np.searchsorted(rows, self.cluster_starts))
+        fit, select, report = (one[rows] for one in (self.fit, self.select, self.report))
+        return DataSplit(fit, select, report, starts[starts < len(rows)], self.noise_overlap)
+
+    def cluster_sums(self, values: Array) -> Array:
+        """Sum values over each cluster.
+
+        Args:
+            values: Values of the rows, (N, ...).
+
+        Returns:
+            Sums, (C, ...).
+        """
+        total: Array = np.add.reduceat(values, self.cluster_starts, axis=0)
+        return total
+
+
+def cluster_starts(samples: Samples) -> NDArray[np.intp]:
+    """Divide the rows into clusters for the tests.
+
+    A cluster begins where a log begins, or when at least `CLUSTER_DURATION_S` has passed and some
+    joint has moved by `CLUSTER_MOTION_RAD`.
+
+    Args:
+        samples: Rows of all logs.
+
+    Returns:
+        Row at which each cluster begins, (C,).
+    """
+    # Intervals of CLUSTER_DURATION_S; merged while the angles of all joints stay within
+    # CLUSTER_MOTION_RAD of those in the first interval of the cluster.
+    at = np.floor(samples.t / CLUSTER_DURATION_S).astype(int) + 10**7 * samples.log_of_row
+    starts = np.flatnonzero(np.diff(at, prepend=at[0] - 1))
+    q = samples.at(0.0, 0.0, 0.0).q
+    log = samples.log_of_row[starts]
+    lowest, highest = np.minimum.reduceat(q, starts, axis=0), np.maximum.reduceat(q, starts, axis=0)
+    kept = [0]
+    for k in range(1, len(starts)):
+        last = kept[-1]
+        moved = np.maximum(highest[k] - lowest[last], highest[last] - lowest[k]).max()
+        if log[k] != log[last] or moved > CLUSTER_MOTION_RAD:
+            kept.append(k)
+    return starts[kept]

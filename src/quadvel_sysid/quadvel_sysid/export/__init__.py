@@ -1,0 +1,1 @@
+"""What the corrected model is used for: parameters of the simulator, replays on a robot."""

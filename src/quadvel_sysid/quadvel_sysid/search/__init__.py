@@ -1,0 +1,1 @@
+"""Candidates, their screening, and the floating forward search among them."""

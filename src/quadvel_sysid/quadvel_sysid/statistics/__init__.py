@@ -1,0 +1,1 @@
+"""Tests, thresholds, intervals and model-free baselines."""
