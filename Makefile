@@ -56,7 +56,7 @@ format: $(VENV)/.lint  ## format the code with ruff and apply its automatic fixe
 
 faults: setup  ## inject faults into a simulated robot and measure its reaction; results in out/faults
 	$(VENV)/bin/quadvel faults --out out/faults
-	$(VENV)/bin/python -m quadvel_bringup.topic_faults
+	$(VENV)/bin/python -m quadvel_lab.topic_faults
 
 bench: setup  ## measure the speed of this machine; results in out/bench.json
 	$(VENV)/bin/quadvel bench --out out/bench.json

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import pytest
 
 from quadvel_bringup.stack import Stack
-from quadvel_bringup.topic_faults import BOARD_FAULTS, FAULTS, TopicFault, TopicRobot
+from quadvel_lab.topic_faults import BOARD_FAULTS, FAULTS, TopicFault, TopicRobot
 from quadvel_policy.faults import table
 
 ONCE_HIDDEN = ("state_not_finite", "attitude_not_unit", "state_stale", "controller_stopped")

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from quadvel_actuator import ActuatorParameters
-from quadvel_bringup.ground_truth_benchmark import PLANTS, read_walk
 from quadvel_eval.replay import torque_error
+from quadvel_lab.ground_truth_benchmark import PLANTS, read_walk
 
 PROGRAM = """
 import sys
 from pathlib import Path
 from rich.console import Console
-from quadvel_bringup.scripted_walk import ScriptedWalk
-from quadvel_bringup.ground_truth_benchmark import plant_nodes
+from quadvel_lab.scripted_walk import ScriptedWalk
+from quadvel_lab.ground_truth_benchmark import plant_nodes
 plant, out = map(Path, sys.argv[1:])
 sys.exit(ScriptedWalk(out, "quick", plant_nodes(plant, seed=1), True, Console()).run() or 0)
 """

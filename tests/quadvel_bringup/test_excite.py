@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quadvel_bringup.excite import RAMP_S, MotionError, MotionPlayer
 from quadvel_description import robot
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
+from quadvel_lab.excite import RAMP_S, MotionError, MotionPlayer
 from quadvel_sysid.excitation import FootLifting
 from quadvel_sysid.logs.read_log import read_log
 
 PROGRAM = """
 import typer
-from quadvel_bringup.excite import excite_command
+from quadvel_lab.excite import excite_command
 app = typer.Typer(pretty_exceptions_enable=False)
 app.command()(excite_command)
 app()

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
-from quadvel_bringup.excite import MotionPlayer
 from quadvel_description import robot
 from quadvel_description.kinematics import HIPS, foot_positions, roll_pitch
 from quadvel_description.mjcf import Plant, load_model
 from quadvel_description.state import JointCommand, RobotState
+from quadvel_lab.excite import MotionPlayer
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sysid.excitation import PERIOD_S, Excitation, FootLifting, Sweep
 from quadvel_sysid.identify import identify

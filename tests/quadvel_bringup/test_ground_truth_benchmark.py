@@ -15,12 +15,12 @@ import typer
 from rich.console import Console
 
 from quadvel_actuator import ActuatorParameters
-from quadvel_bringup import plant as plant_module
-from quadvel_bringup.ground_truth_benchmark import PLANTS, SHIPPED, WALKS, _identify, plant_nodes
-from quadvel_bringup.ground_truth_page import summary_sentence, twin_page
-from quadvel_bringup.plant import ChafingCable, DryGear, HiddenDrives, Plant, SlowCurrent, read_plant
 from quadvel_description import robot
 from quadvel_description.state import JointCommand, RobotState
+from quadvel_lab import plant as plant_module
+from quadvel_lab.ground_truth_benchmark import PLANTS, SHIPPED, WALKS, _identify, plant_nodes
+from quadvel_lab.ground_truth_page import summary_sentence, twin_page
+from quadvel_lab.plant import ChafingCable, DryGear, HiddenDrives, Plant, SlowCurrent, read_plant
 from quadvel_sim import SimulatorConfig
 
 DT = 0.001
@@ -203,7 +203,7 @@ def test_the_page_owns_up_to_a_model_that_got_worse() -> None:
 def test_a_file_that_is_no_plant_ends_its_process_in_one_sentence(tmp_path: Path) -> None:
     file = tmp_path / "plant.yaml"
     file.write_text("kind: rust")
-    line = [sys.executable, "-m", "quadvel_bringup.plant", str(file)]
+    line = [sys.executable, "-m", "quadvel_lab.plant", str(file)]
     ended = subprocess.run(line, capture_output=True, text=True, timeout=300)
     assert ended.returncode == 2
     assert ended.stderr.startswith(f"plant: {file}: kind: found 'rust'")

@@ -13,10 +13,10 @@ import yaml
 
 import quadvel_dds
 from quadvel_bringup import nodes
-from quadvel_bringup.follow_demo import FOLLOW_TOPICS
-from quadvel_bringup.recorded_run import RECORDED_TOPICS
 from quadvel_bringup.stack import PARAMETERS, Stack
 from quadvel_dds.arguments import parse
+from quadvel_lab.follow_demo import FOLLOW_TOPICS
+from quadvel_lab.recorded_run import RECORDED_TOPICS
 
 SRC = Path(__file__).parents[2] / "src"
 
@@ -33,10 +33,10 @@ def declared_parameters() -> dict[str, dict[str, Any]]:
     quadvel_dds.install()
     from quadvel_driver.parameters import DriverParameters
     from quadvel_estimator.estimator import EstimatorParameters
-    from quadvel_eval.scripted_planner import PlannerParameters
     from quadvel_follow.follow_planner import FollowConfig
     from quadvel_follow.person_tracker_node import PersonTrackerParameters
     from quadvel_follow.trajectory_planner import TrajectoryParameters
+    from quadvel_lab.scripted_planner import PlannerParameters
     from quadvel_policy.command_mux_node import MuxParameters
     from quadvel_policy.controller import ControllerParameters
     from quadvel_sim.parameters import BoardParameters, SimParameters

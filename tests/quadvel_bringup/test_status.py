@@ -17,8 +17,8 @@ quadvel_dds.install()
 from geometry_msgs.msg import TwistWithCovarianceStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 
-from quadvel_bringup.demo import _report  # noqa: E402
 from quadvel_bringup.status import STATUS_TOPICS, _lines, running_nodes  # noqa: E402
+from quadvel_lab.demo import _report  # noqa: E402
 from quadvel_msgs.msg import ControllerState  # noqa: E402
 
 NAN = float("nan")

@@ -17,8 +17,8 @@ from rich.console import Console
 
 from quadvel_bringup import up
 from quadvel_bringup.exclusivity import RobotAlreadyRunningError, check_exclusive
-from quadvel_bringup.scripted_walk import ScriptedWalk
 from quadvel_bringup.stack import Stack
+from quadvel_lab.scripted_walk import ScriptedWalk
 
 NODE = """
 import signal, time

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from quadvel_actuator import ActuatorParameters
-from quadvel_bringup.plant import read_plant
 from quadvel_dds.arguments import read_parameter_file
 from quadvel_description.bounded_yaml import MAX_CHARACTERS, MAX_DEPTH, load_yaml
 from quadvel_driver.calibration import Calibration
+from quadvel_lab.plant import read_plant
 from quadvel_sim.world import World
 
 HOSTILE = {

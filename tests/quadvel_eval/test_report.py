@@ -11,9 +11,9 @@ import pytest
 from rich.console import Console
 
 from quadvel_eval.grid import Cell, CellResult, summarise
-from quadvel_eval.output import output_file, output_folder, replacing
 from quadvel_eval.report import evaluation_table, write_evaluation, write_json
 from quadvel_eval.segments import Segment
+from quadvel_recordings.output import output_file, output_folder, replacing
 
 WALKED = CellResult(
     Cell((0.5, 0.0, 0.0), 0),

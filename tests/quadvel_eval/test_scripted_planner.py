@@ -16,7 +16,7 @@ import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 
 from quadvel_eval.script import RETRY_INTERVAL_S  # noqa: E402
-from quadvel_eval.scripted_planner import ScriptedPlanner  # noqa: E402
+from quadvel_lab.scripted_planner import ScriptedPlanner  # noqa: E402
 from quadvel_msgs.msg import ControllerState  # noqa: E402
 from quadvel_msgs.srv import SetMode  # noqa: E402
 

@@ -9,9 +9,9 @@ import onnx
 
 from quadvel_description.network_file import read_network
 from quadvel_description.recurrent_network import METADATA_KEY
-from quadvel_eval.output import replacing
 from quadvel_policy.observation import COMMAND_AXES, CommandLimits
 from quadvel_policy.policy_file import PolicyFile
+from quadvel_recordings.output import replacing
 
 
 def limit_commands(policy: Path, limits: CommandLimits) -> None:

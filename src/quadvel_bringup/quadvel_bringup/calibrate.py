@@ -14,8 +14,8 @@ from rich.table import Table
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import RobotState
 from quadvel_driver.find_calibration import CalibrationDataError, CalibrationFit, Samples, fit_calibration
-from quadvel_eval.output import output_file, replacing
 from quadvel_nodes.messages import read_low_state
+from quadvel_recordings.output import output_file, replacing
 from quadvel_recordings.reading import read_messages
 
 TOPIC = "/low_state"

@@ -88,7 +88,7 @@ class DelegatedCommand:
 
 DELEGATED_COMMANDS = {
     "demo": DelegatedCommand(
-        "quadvel_bringup.demo:demo_command",
+        "quadvel_lab.demo:demo_command",
         SIMULATOR,
         "Walk a simulated robot in all directions, or after a person.",
     ),
@@ -108,7 +108,7 @@ DELEGATED_COMMANDS = {
         "Run actuator model and estimator offline on a recording.",
     ),
     "excite": DelegatedCommand(
-        "quadvel_bringup.excite:excite_command",
+        "quadvel_lab.excite:excite_command",
         LOGS,
         "Run an excitation motion and record it for identification.",
     ),
@@ -158,7 +158,7 @@ DELEGATED_COMMANDS = {
         "Reproduce the figures of the paper: page, plots, tables.",
     ),
     "twin": DelegatedCommand(
-        "quadvel_bringup.ground_truth_benchmark:twin_command",
+        "quadvel_lab.ground_truth_benchmark:twin_command",
         EXPERIMENTS,
         "Benchmark the identification on plants with hidden effects.",
     ),

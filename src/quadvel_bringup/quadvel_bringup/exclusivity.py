@@ -14,7 +14,7 @@ from typing import Any
 import quadvel_dds
 
 TOPIC = "low_state"
-SERVERS = ("sim_node", "board", "driver", "quadvel_bringup.plant")
+SERVERS = ("sim_node", "board", "driver", "quadvel_lab.plant")
 """Words on the command lines of processes that serve TOPIC."""
 DISCOVERY_TIME_S = 0.5
 """Time to discover other publishers."""

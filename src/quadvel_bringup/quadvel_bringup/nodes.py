@@ -48,7 +48,7 @@ NODES = {
     "follow_planner": NodeEntry("quadvel_follow.follow_planner_node", "follows a person, at a set distance"),
     "trajectory_planner": NodeEntry("quadvel_follow.trajectory_planner", "walks a path from a file"),
     "view": NodeEntry("quadvel_view.view_node", "the operator's page in the browser"),
-    "planner": NodeEntry("quadvel_eval.scripted_planner", "commands a scripted walk, as the demo does"),
+    "planner": NodeEntry("quadvel_lab.scripted_planner", "commands a scripted walk, as the demo does"),
 }
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 
 import quadvel_dds
-from quadvel_eval.output import output_file, output_folder
+from quadvel_recordings.output import output_file, output_folder
 
 from .exclusivity import ros_domain
 from .processes import StopSignals

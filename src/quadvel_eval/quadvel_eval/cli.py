@@ -12,13 +12,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from quadvel_actuator import ActuatorParameters
 from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from quadvel_recordings.output import output_file, output_folder
 
 from . import bench
 from .compare import comparison_table, read_evaluation
 from .faults.campaign import run_campaign
 from .faults.report import campaign_summary, campaign_table, write_campaign
 from .grid import evaluate
-from .output import output_file, output_folder
 from .report import evaluation_table, write_evaluation, write_json
 from .walk import Setup
 

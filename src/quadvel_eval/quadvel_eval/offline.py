@@ -24,10 +24,10 @@ from quadvel_estimator.tracker import Estimator, VelocityTracker
 from quadvel_nodes.messages import MessageError, read_low_state
 from quadvel_nodes.number_text import number_text
 from quadvel_nodes.stall_free_clock import StallFreeClock
+from quadvel_recordings.output import output_folder, replacing
 from quadvel_recordings.reading import RecordingError, read_messages
 
 from .demo_figures import AXIS_LABELS
-from .output import output_folder, replacing
 from .recording_plot import (
     CommandTopicOption,
     RecordedRun,

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from quadvel_description.robot import JOINT_NAMES, TORQUE_LIMIT
 from quadvel_recordings.joint_log import JointLog, read_joint_log
+from quadvel_recordings.output import output_folder, replacing
 from quadvel_recordings.reading import RecordingError, read_messages
 from quadvel_recordings.stamps import missing_stamp_notices, stamp_of
 
 from .demo_figures import AXIS_LABELS
-from .output import output_folder, replacing
 from .recording import planar
 
 Array = NDArray[np.float64]

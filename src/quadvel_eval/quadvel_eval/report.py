@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
-from .output import replacing
+from quadvel_recordings.output import replacing
 
 CSV_COLUMNS = (
     "plant",

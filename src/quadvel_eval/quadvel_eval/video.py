@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description.mjcf import load_model
+from quadvel_recordings.output import replacing
 
 from .demo_figures import tracking_figure
 from .demo_summary import constant_commands
-from .output import replacing
 from .recording import Recording, read_recording
 from .report import write_figure
 

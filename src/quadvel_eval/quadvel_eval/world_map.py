@@ -14,9 +14,9 @@ from matplotlib.patches import Circle, Rectangle
 from numpy.typing import ArrayLike
 from rich.console import Console
 
+from quadvel_recordings.output import output_file
 from quadvel_sim.world import SHIPPED_WORLDS, World
 
-from .output import output_file
 from .report import write_figure
 
 FIGURE_WIDTH_IN = 10.0  # inches

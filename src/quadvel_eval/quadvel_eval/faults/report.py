@@ -11,7 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ..output import replacing
+from quadvel_recordings.output import replacing
+
 from ..report import write_json
 from .campaign import (
     MAX_OVERTRAVEL_IN_FALL_RAD,

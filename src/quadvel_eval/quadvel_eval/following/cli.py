@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from quadvel_nodes.number_text import number_text
+from quadvel_recordings.output import output_folder, replacing
 
-from ..output import output_folder, replacing
 from .measure import measure_scenes
 
 HEADS = {

@@ -10,9 +10,9 @@ from rich.console import Console
 
 from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
+from quadvel_recordings.output import output_folder
 
 from ..cli import ClusterOption, walk_progress_bar
-from ..output import output_folder
 from .files import PAGE_FILE
 from .section import Section, Study
 from .study import SECTIONS, Progress, run_sections

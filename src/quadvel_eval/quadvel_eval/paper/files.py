@@ -17,8 +17,8 @@ import attrs
 from matplotlib.figure import Figure
 
 from quadvel_policy.policy_file import PolicyFile
+from quadvel_recordings.output import replacing
 
-from ..output import replacing
 from ..report import read_json, write_figure, write_json
 from .section import Record, Row, Section, Study, distinct
 

@@ -13,8 +13,8 @@ from typing_extensions import override
 
 from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_description.robot import JOINT_NAMES
+from quadvel_recordings.output import replacing
 
-from ..output import replacing
 from .cells import Command, cell_record, command_limits, count_falls, largest_error, mean_error
 from .conditions import Condition, condition_job, draw_error_and_survival
 from .identification import record_mixed_walk

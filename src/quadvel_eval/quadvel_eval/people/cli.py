@@ -13,8 +13,8 @@ from rich.table import Table
 
 from quadvel_follow.leg_detector import SHIPPED_MODEL, LegDetector
 from quadvel_nodes.number_text import number_text
+from quadvel_recordings.output import output_folder, replacing
 
-from ..output import output_folder, replacing
 from .figure import draw_tracks
 from .measure import ScanRecording, measure_files, measure_scenes
 

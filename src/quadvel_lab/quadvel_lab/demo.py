@@ -14,20 +14,20 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.console import Console
 
+from quadvel_bringup.doctor import GL_PACKAGES, gl_backend, video_encoder
+from quadvel_bringup.preflight import check_stack
+from quadvel_bringup.stack import Stack
 from quadvel_eval import demo_figures, demo_summary
 from quadvel_eval.following.tour import TourSetup
 from quadvel_eval.following.tour_cli import run_tour
-from quadvel_eval.output import output_folder, replacing
 from quadvel_eval.recording import Recording, read_recording
 from quadvel_eval.report import segment_table, write_figure, write_json
 from quadvel_nodes.number_text import number_text
+from quadvel_recordings.output import output_folder, replacing
 from quadvel_sim.world import SHIPPED_WORLDS
 
-from .doctor import GL_PACKAGES, gl_backend, video_encoder
 from .follow_demo import follow
-from .preflight import check_stack
 from .scripted_walk import ScriptedWalk
-from .stack import Stack
 
 WALK, FOLLOW, TOUR = "quadvel demo walk", "quadvel demo follow", "quadvel demo follow --tour"
 OPTION_SCOPES = {

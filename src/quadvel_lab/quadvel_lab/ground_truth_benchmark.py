@@ -22,20 +22,20 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from quadvel_actuator import ActuatorParameters
+from quadvel_bringup.processes import ProcessGroup, StopSignals
+from quadvel_bringup.stack import Stack
 from quadvel_eval import demo_summary, replay
-from quadvel_eval.output import output_folder, replacing
 from quadvel_eval.pool import Call, run_in_parallel
 from quadvel_eval.recording import Recording, read_recording
 from quadvel_eval.report import read_json, write_json
 from quadvel_eval.script import SCRIPTS, Drive
 from quadvel_eval.segments import Segment, rounded
+from quadvel_recordings.output import output_folder, replacing
 
 from .ground_truth_page import ROWS, summary_sentence, twin_page
 from .plant import read_plant
-from .processes import ProcessGroup, StopSignals
 from .recorded_run import POLL_PERIOD_S
 from .scripted_walk import ScriptedWalk
-from .stack import Stack
 
 PLANTS = Path(__file__).parent / "config" / "plants"
 SHIPPED = ("dry_gears", "slow_current", "chafing_cable")
@@ -110,7 +110,7 @@ def plant_nodes(file: Path, seed: int) -> dict[str, list[str]]:
     """
     commands = Stack(use_sim_time=True).commands()
     arguments = Stack(use_sim_time=True).arguments()["sim_node"]
-    commands["sim_node"] = [sys.executable, "-m", "quadvel_bringup.plant", str(file.resolve()), *arguments]
+    commands["sim_node"] = [sys.executable, "-m", "quadvel_lab.plant", str(file.resolve()), *arguments]
     for name in ("sim_node", "estimator", "controller"):
         commands[name] += ["-r", "low_state:=board/low_state"]
     commands["sim_node"] += ["-r", "joint_log:=low_state", "-p", f"seed:={seed}"]

@@ -13,15 +13,15 @@ from typing import Any
 
 from rich.console import Console
 
+from quadvel_bringup.nodes import process_command, ros_arguments
+from quadvel_bringup.preflight import check_stack
+from quadvel_bringup.stack import Stack
 from quadvel_eval.following.recorded import read_following
 from quadvel_eval.following.tour_report import tour_table, write_tour
-from quadvel_eval.output import replacing
+from quadvel_recordings.output import replacing
 from quadvel_sim.world import World
 
-from .nodes import process_command, ros_arguments
-from .preflight import check_stack
 from .recorded_run import RecordedRun
-from .stack import Stack
 
 FOLLOW_TOPICS = {
     "/cmd_vel_follow": "geometry_msgs/msg/Twist",

@@ -9,11 +9,10 @@ from geometry_msgs.msg import Twist
 from rclpy.node import Node
 from std_msgs.msg import String
 
+from quadvel_eval.script import SCRIPTS, ScriptError, ScriptRunner, Velocity
 from quadvel_msgs.msg import ControllerState
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.node import read_parameters, request_exit, run
-
-from .script import SCRIPTS, ScriptError, ScriptRunner, Velocity
 
 CMD_VEL_PERIOD_S = 0.02
 

@@ -15,12 +15,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import quadvel_dds
-
-from .exclusivity import ensure_exclusive
-from .node_output import PrefixedOutput
-from .nodes import enclave
-from .page_watch import PageWatch
-from .processes import ProcessGroup, StopSignals
+from quadvel_bringup.exclusivity import ensure_exclusive
+from quadvel_bringup.node_output import PrefixedOutput
+from quadvel_bringup.nodes import enclave
+from quadvel_bringup.page_watch import PageWatch
+from quadvel_bringup.processes import ProcessGroup, StopSignals
 
 RECORDED_TOPICS = {
     "/command": "quadvel_msgs/msg/VelocityCommand",
@@ -104,8 +103,8 @@ class RecordedRun(ABC):
         from rclpy.parameter import Parameter
         from rclpy.signals import SignalHandlerOptions
 
-        from .recorder import Recorder
-        from .recording_file import RecordingFile
+        from quadvel_bringup.recorder import Recorder
+        from quadvel_bringup.recording_file import RecordingFile
 
         rclpy.init(args=["--ros-args", *enclave("recorder")], signal_handler_options=SignalHandlerOptions.NO)
         use_sim_time = Parameter("use_sim_time", value=self._lockstep)

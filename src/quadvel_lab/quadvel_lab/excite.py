@@ -19,20 +19,19 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import quadvel_dds
+from quadvel_bringup.exclusivity import ensure_exclusive
+from quadvel_bringup.node_output import PrefixedOutput
+from quadvel_bringup.nodes import Parameters, enclave, process_command, ros_arguments
+from quadvel_bringup.preflight import check_node
+from quadvel_bringup.processes import ProcessGroup, StopSignals
+from quadvel_bringup.stack import PARAMETERS
 from quadvel_description import robot
 from quadvel_description.kinematics import roll_pitch
 from quadvel_description.state import JointCommand, RobotState
-from quadvel_eval.output import output_file, replacing
 from quadvel_eval.report import read_json
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
+from quadvel_recordings.output import output_file, replacing
 from quadvel_sysid.excitation import EXCITATIONS, PERIOD_S, Excitation, limit_torque, propose
-
-from .exclusivity import ensure_exclusive
-from .node_output import PrefixedOutput
-from .nodes import Parameters, enclave, process_command, ros_arguments
-from .preflight import check_node
-from .processes import ProcessGroup, StopSignals
-from .stack import PARAMETERS
 
 RAMP_S = 1.5
 """Time from the initial posture to the start of the motion."""
@@ -350,8 +349,8 @@ class _Session:
         """
         from rclpy.executors import SingleThreadedExecutor
 
-        from .recorder import Recorder
-        from .recording_file import RecordingFile
+        from quadvel_bringup.recorder import Recorder
+        from quadvel_bringup.recording_file import RecordingFile
 
         task = bar.add_task("", total=self._player.total)
         playing, recording = (

@@ -8,9 +8,9 @@ from typing import Any
 
 from rich.console import Console
 
+from quadvel_bringup.nodes import enclave, process_command
 from quadvel_eval.script import SCRIPTS
 
-from .nodes import enclave, process_command
 from .recorded_run import RecordedRun
 
 PLANNED = {"/cmd_vel": "geometry_msgs/msg/Twist", "/planner/step": "std_msgs/msg/String"}

@@ -2,7 +2,7 @@
 
 `quadvel faults` injects faults into the classes from many seeds and measures reaction times. This
 module shows that the same faults arise from messages, and that the operator sees their names:
-`python -m quadvel_bringup.topic_faults`. Needs `rclpy`.
+`python -m quadvel_lab.topic_faults`. Needs `rclpy`.
 """
 
 from __future__ import annotations
@@ -28,14 +28,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistWithCovarianceStamped
 from rclpy.qos import QoSProfile
 
+from quadvel_bringup.processes import ProcessGroup
+from quadvel_bringup.session import Session
+from quadvel_bringup.stack import Stack
 from quadvel_description.robot import TORQUE_LIMIT, UPPER
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand
 from quadvel_msgs.srv import ResetSim, SetMode
 from quadvel_policy.command_limits import LIMITS
-
-from .processes import ProcessGroup
-from .session import Session
-from .stack import Stack
 
 Message = Any
 Change = Callable[["Relay", Message], Message | None]
