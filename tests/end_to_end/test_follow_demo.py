@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_follow.planar import planar_pose
 from quadvel_nodes.messages import seconds
 from quadvel_recordings.reading import read_messages
 
 QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
-Array = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import torch
 from mujoco.batch import Batch
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_policy.observation import DEFAULT_OBSERVATION
 
 from . import dagger
@@ -24,9 +24,7 @@ from .networks import Mlp, Recurrent
 from .rewards import RewardWeights, Table2
 
 
-def _time_interleaved(
-    jobs: Mapping[str, Callable[[], object]], rounds: int
-) -> dict[str, NDArray[np.float64]]:
+def _time_interleaved(jobs: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, Array]:
     """Time jobs in turn, after a warm-up call of each; return seconds (rounds,) of each job.
 
     In each round the jobs run one after the other, so that a slow phase of the machine affects all
@@ -43,9 +41,7 @@ def _time_interleaved(
     return {name: np.array(times) for name, times in seconds.items()}
 
 
-def _rate_and_ratio(
-    amount: str, count: int, whole: NDArray[np.float64], bare: NDArray[np.float64]
-) -> dict[str, float]:
+def _rate_and_ratio(amount: str, count: int, whole: Array, bare: Array) -> dict[str, float]:
     """Return median rates per second of the whole and its bare parts, and their ratio."""
     return {
         f"{amount}_per_s": count / float(np.median(whole)),

@@ -10,12 +10,11 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array, Bools
 from quadvel_eval.people.laser import FloorPlan, Laser
 from quadvel_follow.clusters import FEATURE_COUNT, MAX_CLUSTER_WIDTH_M, Scan, cluster_features, find_clusters
 from quadvel_follow.free_space import to_frame
 from quadvel_sim.walker import Walker, leg_circles
-
-Array = NDArray[np.float64]
 
 LABEL_RADIUS_M = 0.12  # between a label and its object
 FIXED_RADIUS_M = 0.05  # within which a fixed object is found again
@@ -34,7 +33,7 @@ class Examples:
     """
 
     things: NDArray[np.float32]
-    legs: NDArray[np.bool_]
+    legs: Bools
 
     @classmethod
     def concatenate(cls, parts: Sequence[Examples]) -> Examples:
@@ -123,7 +122,7 @@ def _walking(content: dict[str, Any], step: int, rng: np.random.Generator) -> It
         yield _select_examples(scan, person, person | (still & ~nearer))
 
 
-def _select_examples(scan: Scan, legs: NDArray[np.bool_], kept: NDArray[np.bool_]) -> Examples:
+def _select_examples(scan: Scan, legs: Bools, kept: Bools) -> Examples:
     """Describe the objects of a scan, and select some."""
     return Examples(cluster_features(scan, find_clusters(scan))[kept], legs[kept])
 
@@ -138,7 +137,7 @@ class _FixedObjects:
         ]
         self._seen = [find_clusters(scan).centre for scan in scans[:: max(1, len(scans) // 100)]]
 
-    def __call__(self, centre: Array) -> NDArray[np.bool_]:
+    def __call__(self, centre: Array) -> Bools:
         shares = np.mean([_nearest(centre, seen) < FIXED_RADIUS_M for seen in self._seen], axis=0)
         return shares > FIXED_SHARE
 

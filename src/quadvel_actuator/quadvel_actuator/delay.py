@@ -9,7 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from quadvel_description.arrays import Array
 
 MAX_DELAY_S = 0.05
 
@@ -43,7 +45,7 @@ class DelayLine:
         self.delay: ArrayLike = 0.0
 
     @property
-    def delay(self) -> NDArray[np.float64]:
+    def delay(self) -> Array:
         """Delay in s, (..., 1), as a copy; assign anything that broadcasts to this shape."""
         return self._delay.copy()
 
@@ -75,14 +77,14 @@ class DelayLine:
         self._back = self._row - n.ravel() * self._row.size
         self._fraction = np.broadcast_to(fraction, self._ring.shape[1:]).copy() if fraction.any() else None
 
-    def push(self) -> NDArray[np.float64]:
+    def push(self) -> Array:
         """Begin a step.
 
         Returns:
             The slot (..., C) to write the sample of this step into, a view of the ring.
         """
         self.head = (self.head + 1) % self.length
-        slot: NDArray[np.float64] = self._ring[self.head]
+        slot: Array = self._ring[self.head]
         return slot
 
     def fill_history(self, where: Any) -> None:
@@ -93,7 +95,7 @@ class DelayLine:
         """
         self._ring[:, where] = self._ring[self.head][where]
 
-    def read(self) -> NDArray[np.float64]:
+    def read(self) -> Array:
         """Interpolate the delayed sample of this step.
 
         Returns:
@@ -108,9 +110,9 @@ class DelayLine:
             sample += older
         return sample
 
-    def _sample_back(self, extra: int) -> NDArray[np.float64]:
+    def _sample_back(self, extra: int) -> Array:
         """Return the sample `extra` steps before the whole number n of delayed steps."""
-        sample: NDArray[np.float64]
+        sample: Array
         if self._common is not None:
             sample = self._ring[self.head - self._common - extra].copy()
         else:

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from quadvel_actuator.delay import DelayLine
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_actuator.running import RunningEffects
+from quadvel_description.arrays import Array
 from quadvel_description.robot import JOINT_NAMES
 
-Array = NDArray[np.float64]
 Values = float | Array
 
 _NOISE_BLOCK_SAMPLES = 16384  # drawn at a time

@@ -10,15 +10,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadvel_actuator.delay import DelayLine
 from quadvel_actuator.effects import DRIVE, JOINT, EffectLaw, MemoryLaw, Stage, registry
 from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
 from quadvel_actuator.effects.terms import RunningTerms, Term, load_terms
 from quadvel_actuator.parameters import Effect
-
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array, Bools
 
 _STATE_HISTORY_S = 0.03
 """Length of the history of positions and velocities, s"""
@@ -134,7 +132,7 @@ class _RunningEffect:
             self.values[name] = values
         self.values = self.law.canonical(self.values)
 
-    def apply(self, x: Any, now: StepView, new: NDArray[np.bool_] | None) -> Any:
+    def apply(self, x: Any, now: StepView, new: Bools | None) -> Any:
         """Return the value in place of `x`; environments that are `new` start from rest."""
         law = self.law
         if isinstance(law, MemoryLaw):
@@ -265,7 +263,7 @@ class RunningEffects:
         for one in self._all:
             one.sample(ids, rng, shape)
 
-    def push_targets(self, q_des: Any, dq_des: Any, new: NDArray[np.bool_] | None) -> None:
+    def push_targets(self, q_des: Any, dq_des: Any, new: Bools | None) -> None:
         """Push the targets of this step into their delay line.
 
         Args:
@@ -281,7 +279,7 @@ class RunningEffects:
             self.targets.fill_history(new)
 
     def drive_torque(
-        self, torque: Array, q: Array, dq: Array, kp_hat: Array, kd_hat: Array, new: NDArray[np.bool_] | None
+        self, torque: Array, q: Array, dq: Array, kp_hat: Array, kd_hat: Array, new: Bools | None
     ) -> Array:
         """Apply all effects that act in the drive.
 
@@ -317,7 +315,7 @@ class RunningEffects:
             total = total + one.apply(torque, now, new)
         return total + self._terms.step(total, now, new)
 
-    def joint_torque(self, torque: Array, new: NDArray[np.bool_] | None) -> Array:
+    def joint_torque(self, torque: Array, new: Bools | None) -> Array:
         """Add the effects that act at the joint.
 
         Args:
@@ -332,7 +330,7 @@ class RunningEffects:
             total = total + one.apply(torque, self._now, new)
         return total + self._terms_at_joint.step(total, self._now, new)
 
-    def _update_view(self, q: Array, dq: Array, new: NDArray[np.bool_] | None) -> StepView:
+    def _update_view(self, q: Array, dq: Array, new: Bools | None) -> StepView:
         """Take the state of this step into the view and its history."""
         now = self._now
         now.q, now.dq = np.array(q), np.broadcast_to(dq, q.shape).astype(float)

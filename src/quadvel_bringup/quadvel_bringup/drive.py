@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistWithCovarianceStamped
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quadvel_description.arrays import Array
 from quadvel_msgs.msg import ControllerState, VelocityCommand
 from quadvel_nodes.number_text import number_text
 
@@ -30,8 +31,6 @@ SAME_TOLERANCE = 1e-3
 """Largest difference of equal commands, m/s or rad/s."""
 MAX_ESTIMATES = 10_000
 """Number of estimates for the mean, 50 s."""
-
-Array = NDArray[np.float64]
 
 
 class DriveRun:

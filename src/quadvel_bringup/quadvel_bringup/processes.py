@@ -1,4 +1,4 @@
-"""Groups of child processes that end together, and signals that stop a command.
+"""Indices of child processes that end together, and signals that stop a command.
 
 It does not restart processes.
 """

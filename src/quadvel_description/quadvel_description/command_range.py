@@ -8,14 +8,13 @@ beyond the range is therefore sent as feed-forward torque, so that the joint tor
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from .arrays import Array
 from .robot import COMMAND_LOWER, COMMAND_UPPER, LOWER, TORQUE_LIMIT, UPPER
 
 STOP_STIFFNESS_NM_PER_RAD = 100.0
 """Largest feed-forward torque toward a mechanical stop by the remaining distance to it."""
-
-Array = NDArray[np.float64]
 
 
 def clip_to_command_range(target: ArrayLike) -> Array:

@@ -12,12 +12,10 @@ from __future__ import annotations
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
 from . import robot
+from .arrays import Array
 from .kinematics import foot_positions, rotate, rotate_inverse, yaw
-
-Array = NDArray[np.float64]
 
 ODOM = "odom"
 BASE = "base_link"

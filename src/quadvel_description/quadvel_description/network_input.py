@@ -13,6 +13,8 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .arrays import Array
+
 
 def _floats(value: float | Iterable[float]) -> float | tuple[float, ...]:
     """Return a number or a tuple of numbers, as JSON stores them."""
@@ -74,7 +76,7 @@ class InputLayout:
         self.size = sum(term.size for term in self.terms)
         self.names = tuple(term.name for term in self.terms)
 
-        def spread(values: Iterable[Any]) -> NDArray[np.float64]:
+        def spread(values: Iterable[Any]) -> Array:
             return np.concatenate(
                 [np.broadcast_to(v, t.size) for t, v in zip(self.terms, values, strict=True)]
             )

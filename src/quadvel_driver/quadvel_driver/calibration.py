@@ -12,8 +12,8 @@ from typing import Any
 import attrs
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_description.bounded_yaml import read_yaml
 from quadvel_description.kinematics import rotate, rotate_inverse
 from quadvel_description.robot import JOINT_NAMES
@@ -21,7 +21,6 @@ from quadvel_description.state import JointCommand, RobotState
 
 SCHEMA = 1
 MAX_OFFSET_RAD = 0.35  # a sensor with a larger offset is broken or mounted wrongly
-Array = NDArray[np.float64]
 
 
 class CalibrationError(ValueError):

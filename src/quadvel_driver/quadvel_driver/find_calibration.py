@@ -15,10 +15,10 @@ from collections.abc import Iterable
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from quadvel_description import robot
+from quadvel_description.arrays import Array, Bools
 from quadvel_description.kinematics import foot_positions, rotate, rotate_inverse
 from quadvel_description.state import RobotState
 
@@ -34,7 +34,6 @@ ZERO_PRIOR_RAD = 0.035  # (2 deg), prior standard deviation of an encoder zero
 TORQUE_SCALE_PRIOR = 0.1  # prior standard deviation of the scale of measured torques
 REVERSAL_MARGIN = 30  # states around a reversal to leave out: the joint accelerates there
 UP = np.array([0.0, 0.0, 1.0])
-Array = NDArray[np.float64]
 
 
 class CalibrationDataError(ValueError):
@@ -229,11 +228,11 @@ def _leg_zeros(suspended: Samples, down: Array, leg: int, start: Array) -> tuple
     return fit.x[:3], errors[:3]
 
 
-def _is_steady(dq: Array) -> NDArray[np.bool_]:
+def _is_steady(dq: Array) -> Bools:
     """Return the rows of joint speeds (n, 3) in which all joints move, and none reverses nearby, (n,)."""
     under_way = np.abs(dq) > MIN_MOVING_SPEED
     same = np.sign(dq[1:]) == np.sign(dq[:-1])
-    steady: NDArray[np.bool_] = np.all(under_way, axis=1)
+    steady: Bools = np.all(under_way, axis=1)
     steady = np.logical_and(steady, np.append(True, same.all(axis=1)))
     around = np.convolve(np.logical_not(steady), np.ones(2 * REVERSAL_MARGIN + 1), mode="same")
     return np.asarray(around < 0.5)

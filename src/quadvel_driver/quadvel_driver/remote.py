@@ -17,7 +17,8 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
+
+from quadvel_description.arrays import Array
 
 from .wire import Button, Remote
 
@@ -88,7 +89,7 @@ class RemotePilot:
     def __init__(self, config: RemoteConfig = RemoteConfig()) -> None:
         self._config = config
         self._buttons = Button(0)
-        self._sticks: NDArray[np.float64] = np.zeros(3)
+        self._sticks: Array = np.zeros(3)
         self._moved_at: float | None = None
         self.stopped = False
 
@@ -119,7 +120,7 @@ class RemotePilot:
             return order
         return order if self.stopped == (order is OperatorCommand.RELEASE) else None
 
-    def velocity(self, now: float) -> NDArray[np.float64] | None:
+    def velocity(self, now: float) -> Array | None:
         """Return the velocity that the sticks command.
 
         Args:
@@ -134,8 +135,8 @@ class RemotePilot:
         return self._sticks.copy()
 
 
-def _apply_dead_zone(sticks: NDArray[np.float64], dead_zone: float) -> NDArray[np.float64]:
+def _apply_dead_zone(sticks: Array, dead_zone: float) -> Array:
     """Clip sticks to -1..1 and remove the dead zone d: sign(s) max(|s| - d, 0) / (1 - d)."""
     deflection = np.clip(np.abs(sticks), 0.0, 1.0) - dead_zone
-    share: NDArray[np.float64] = np.sign(sticks) * np.maximum(deflection, 0.0) / (1.0 - dead_zone)
+    share: Array = np.sign(sticks) * np.maximum(deflection, 0.0) / (1.0 - dead_zone)
     return share

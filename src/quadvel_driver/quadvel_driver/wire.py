@@ -20,6 +20,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_description.robot import JOINT_NAMES, LEGS
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 
@@ -398,7 +399,7 @@ def _mode(modes: NDArray[np.uint8]) -> int:
     return MODE_SERVO if (modes == MODE_SERVO).any() else MODE_DAMPING
 
 
-def _roll_pitch_yaw(quaternion: NDArray[np.float64]) -> tuple[float, float, float]:
+def _roll_pitch_yaw(quaternion: Array) -> tuple[float, float, float]:
     """Return the angles (rad) of rotations about z, y, x in this order; zeros for a zero quaternion."""
     length = math.hypot(*quaternion.tolist())
     w, x, y, z = (quaternion / length).tolist() if length > 0.0 else (1.0, 0.0, 0.0, 0.0)
@@ -409,7 +410,7 @@ def _roll_pitch_yaw(quaternion: NDArray[np.float64]) -> tuple[float, float, floa
     )
 
 
-def _counts(values: NDArray[np.float64]) -> NDArray[np.int16]:
+def _counts(values: Array) -> NDArray[np.int16]:
     return np.clip(np.trunc(values), -_COUNTS, _COUNTS - 1).astype(np.int16)
 
 
@@ -430,7 +431,7 @@ def _remote(data: bytes) -> Remote:
     return Remote(Button(int(fields["buttons"])), **sticks)
 
 
-def _not_finite(kind: str, numbers: dict[str, NDArray[np.float64]]) -> WireError:
+def _not_finite(kind: str, numbers: dict[str, Array]) -> WireError:
     """Return the error for the first field with a number that is not finite."""
     for field, values in numbers.items():
         for i, value in enumerate(values):

@@ -15,12 +15,12 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
+from quadvel_description.arrays import Array
 from quadvel_description.frames import BASE, ODOM, Placed, footprint
 from quadvel_description.kinematics import rotate
 from quadvel_description.state import RobotState
@@ -216,7 +216,7 @@ def _fill_twist(twist: Any, state: RobotState, estimate: Estimate) -> None:
     twist.covariance = _covariance(estimate.covariance, GYRO_VARIANCE)
 
 
-def _covariance(linear: NDArray[np.float64], angular_variance: float) -> NDArray[np.float64]:
+def _covariance(linear: Array, angular_variance: float) -> Array:
     """Return the 36 numbers of a 6 x 6 covariance, row by row: x, y, z and the rotations about them."""
     matrix = angular_variance * _ANGULAR
     matrix[:3, :3] = linear

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_description.kinematics import rotation_matrix
 from quadvel_description.network_input import InputLayout, InputTerm
 from quadvel_description.robot import GRAVITY, JOINT_NAMES, NOMINAL_Q
@@ -80,7 +81,7 @@ def build(
     return layout.build({name: _QUANTITIES[name](state, previous_action) for name in layout.names})
 
 
-def previous_action(q_target: ArrayLike, mode: int) -> NDArray[np.float64]:
+def previous_action(q_target: ArrayLike, mode: int) -> Array:
     """Compute the `previous_action` of `build` from the last joint command.
 
     Args:

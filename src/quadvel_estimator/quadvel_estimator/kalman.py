@@ -16,15 +16,14 @@ from typing import Any, Literal
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quadvel_description.arrays import Array
 from quadvel_description.kinematics import foot_kinematics, rotation_matrix
 from quadvel_description.robot import GRAVITY
 from quadvel_description.state import RobotState
 
 from .odometry import foot_velocity_in_trunk, rolling_velocity
-
-Array = NDArray[np.float64]
 
 VELOCITY_ROW = 1  # row of v in the state; row 0 is p, rows 2 to 5 are f_1..f_4
 FOOT_ROWS = slice(2, 6)

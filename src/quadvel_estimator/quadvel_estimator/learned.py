@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quadvel_description.arrays import Array
 from quadvel_description.network_file import NetworkFileError
 from quadvel_description.network_input import InputLayout
 from quadvel_description.recurrent_network import RecurrentNetwork
@@ -52,9 +53,7 @@ class LearnedEstimator:
         """Reset the recurrent state of the network."""
         self._network.reset()
 
-    def update(
-        self, state: RobotState, previous_action: ArrayLike
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def update(self, state: RobotState, previous_action: ArrayLike) -> tuple[Array, Array]:
         """Process one sample.
 
             v = s * output,   covariance = diag(s^2 exp(log_variance)),   s = output_scale

@@ -7,13 +7,11 @@ Both estimators use it and decide themselves which foot is planted. Arrays may h
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_description.kinematics import foot_kinematics, rotation_matrix
 from quadvel_description.robot import FOOT_RADIUS
 from quadvel_description.state import RobotState
-
-Array = NDArray[np.float64]
 
 # (a @ CROSS).reshape(3, 3) is the matrix by which a row vector b becomes a x b.
 CROSS_PRODUCT_TENSOR = np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)

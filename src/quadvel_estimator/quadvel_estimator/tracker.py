@@ -9,16 +9,15 @@ from typing import Protocol
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quadvel_description.arrays import Array
 from quadvel_description.kinematics import rotate
 from quadvel_description.state import RobotState
 from quadvel_nodes.messages import MessageError
 from quadvel_nodes.tick_grid import TickGrid
 
 from .features import RATE_HZ
-
-Array = NDArray[np.float64]
 
 MAX_STALE_STATES = 10
 """Number of consecutive ordered states, all older than the newest, after which the clock counts as

@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from quadvel_description.arrays import Array, Bools
 
 from .recording import Recording
 from .segments import SETTLING_TIME_S, Segment, measure_segment, rounded, tracking_errors
-
-Array = NDArray[np.float64]
 
 MAX_COMMAND_GAP_S = 2.0  # a longer silence ends a segment; a shorter one is a stall and counts
 MIN_SEGMENT_S = SETTLING_TIME_S + 0.5  # shorter segments are left out
@@ -37,7 +36,7 @@ def constant_commands(planned_time: Array, planned: Array) -> list[tuple[float, 
     return [(start, end, velocity) for start, end, velocity in found if end - start >= MIN_SEGMENT_S]
 
 
-def count_falls(height: Array, quaternion: Array, upright: NDArray[np.bool_]) -> int:
+def count_falls(height: Array, quaternion: Array, upright: Bools) -> int:
     """Count how often the robot changed from standing to lying.
 
     Args:

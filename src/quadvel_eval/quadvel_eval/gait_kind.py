@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
 from quadvel_description import robot
+from quadvel_description.arrays import Array, Bools, Indices
 
 DIAGONAL_PAIRS = (("FR", "RL"), ("FL", "RR"))
 SIDE_PAIRS = (("FR", "RR"), ("FL", "RL"))
 
 
-def touchdowns(contact: NDArray[np.bool_]) -> NDArray[np.intp]:
+def touchdowns(contact: Bools) -> Indices:
     """Find the touchdowns of one foot.
 
     Args:
@@ -24,7 +24,7 @@ def touchdowns(contact: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.flatnonzero(~contact[:-1] & contact[1:]) + 1
 
 
-def gait_frequency(contact: NDArray[np.bool_], period: float) -> float:
+def gait_frequency(contact: Bools, period: float) -> float:
     """Return the steps per second of a foot, as mean over the feet.
 
     Args:
@@ -39,7 +39,7 @@ def gait_frequency(contact: NDArray[np.bool_], period: float) -> float:
     return float(np.mean(rates)) if len(rates) == 4 else 0.0
 
 
-def contact_agreement(contact: NDArray[np.bool_], pairs: tuple[tuple[str, str], ...]) -> float:
+def contact_agreement(contact: Bools, pairs: tuple[tuple[str, str], ...]) -> float:
     """Return the share of time in which both feet of a pair are in the same contact state.
 
     Args:
@@ -72,7 +72,7 @@ class GaitKind:
     sway: float
 
     @classmethod
-    def of(cls, contact: NDArray[np.bool_], sideways: NDArray[np.float64], period: float) -> GaitKind:
+    def of(cls, contact: Bools, sideways: Array, period: float) -> GaitKind:
         """Compute the figures of a steady walk.
 
         Args:

@@ -10,16 +10,14 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_sim.physics import HELD_OUT_PHYSICS
 
 from .pool import Call, run_in_parallel
 from .robot_loop import CONTROL_PERIOD_S, RobotLoop
 from .segments import SETTLING_TIME_S, Segment, measure_segment, response_delay, rounded, tracking_errors
 from .walk import Setup, Walk, cost_of_transport, jitter, make_loop, record_walk
-
-Array = NDArray[np.float64]
 
 SCHEMA = 1
 COMMAND_DURATION_S = 6.0  # of each command; the last 4 s are evaluated

@@ -11,11 +11,11 @@ import attrs
 import numpy as np
 import typer
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 from quadvel_actuator import ActuatorParameters
+from quadvel_description.arrays import Array
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
@@ -40,8 +40,6 @@ from .recording_plot import (
 )
 from .replay import HISTORY_MS, JointRecord, joints_from_log, modelled_torque, read_joints
 from .segments import rounded
-
-Array = NDArray[np.float64]
 
 MAX_STATE_PERIOD_S = 0.005
 WARM_UP_S = 0.5

@@ -12,12 +12,10 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_nodes.messages import seconds
 from quadvel_recordings.reading import read_messages
-
-Array = NDArray[np.float64]
 
 SIMULATOR_NODES = ("sim_node", "board")  # nodes that report the realtime factor
 TOPICS = (

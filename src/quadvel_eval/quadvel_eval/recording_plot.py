@@ -17,8 +17,8 @@ import numpy as np
 import typer
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_description.robot import JOINT_NAMES, TORQUE_LIMIT
 from quadvel_recordings.joint_log import JointLog, read_joint_log
 from quadvel_recordings.output import output_folder, replacing
@@ -27,8 +27,6 @@ from quadvel_recordings.stamps import missing_stamp_notices, stamp_of
 
 from .demo_figures import AXIS_LABELS
 from .recording import planar
-
-Array = NDArray[np.float64]
 
 MAX_POINTS_PER_LINE = 4000  # more are invisible
 LOOP_QUANTITIES = {

@@ -12,11 +12,11 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import interp1d
 from scipy.signal import savgol_filter
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
+from quadvel_description.arrays import Array, Bools
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand
 from quadvel_nodes.messages import seconds
@@ -31,8 +31,6 @@ from .recording import Recording
 from .robot_loop import CONTROL_PERIOD_S, RobotLoop, make_estimator
 from .segments import SETTLING_TIME_S, Segment, measure_segment
 from .walk import Setup
-
-Array = NDArray[np.float64]
 
 STRETCH_DURATION_S = 0.2  # of one open-loop replay
 STRETCH_INTERVAL_S = 0.35  # between stretches; not a multiple of the gait period
@@ -60,7 +58,7 @@ class JointRecord:
     dq: Array
     tau: Array
     command: Array
-    recorded: NDArray[np.bool_]
+    recorded: Bools
 
     def is_complete(self, begin: int, end: int) -> bool:
         """Return whether a range of rows exists and every state in it was recorded.

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from rich.table import Table
 
+from quadvel_description.arrays import Array
 from quadvel_recordings.output import replacing
 
 CSV_COLUMNS = (
@@ -131,7 +131,7 @@ def error_heatmaps(panels: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
 
 def _mean_errors(
     panel: Axes, cells: Sequence[Mapping[str, Any]], vx: Sequence[float], vy: Sequence[float]
-) -> NDArray[np.float64]:
+) -> Array:
     """Mean errors over the seeds (vx, vy), nan if all fell; draws a cross at each fall."""
     image = np.full((len(vx), len(vy)), np.nan)
     for i, x in enumerate(vx):

@@ -15,8 +15,9 @@ from types import MappingProxyType
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quadvel_description.arrays import Array
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
@@ -26,8 +27,6 @@ from quadvel_policy.command_mux import CommandMux, MuxInput
 from quadvel_policy.observation import RATE_HZ
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import DT, Simulator, Truth
-
-Array = NDArray[np.float64]
 
 CONTROL_PERIOD_S = 1.0 / RATE_HZ
 ESTIMATORS = ("learned", "kalman", "truth")

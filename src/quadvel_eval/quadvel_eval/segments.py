@@ -10,9 +10,9 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
 
 SETTLING_TIME_S = 2.0  # at the start of each stretch, not evaluated
 DECIMALS = 6  # of numbers in JSON files

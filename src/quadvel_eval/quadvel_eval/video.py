@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_description.mjcf import load_model
 from quadvel_recordings.output import replacing
 
@@ -94,7 +95,7 @@ def frame_strip(recording: Recording) -> list[tuple[str, Image]]:
     return [(_caption(velocity), image) for (_, _, velocity), image in zip(picked, images, strict=True)]
 
 
-def _caption(velocity: NDArray[np.float64]) -> str:
+def _caption(velocity: Array) -> str:
     """Nonzero components of a command as text."""
     return ", ".join(f"{axis} {x:g}" for axis, x in zip(("vx", "vy", "wz"), velocity, strict=True) if x)
 

@@ -11,10 +11,11 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_description import robot
+from quadvel_description.arrays import Array, Bools
 from quadvel_description.kinematics import rotate, yaw
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL
@@ -24,8 +25,6 @@ from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.terrain import Terrain
 
 from .robot_loop import CONTROL_PERIOD_S, RobotLoop, Sample, make_estimator
-
-Array = NDArray[np.float64]
 
 TERRAINS = ("flat", "rough", "slope")
 SLOPE_ANGLE_RAD = 0.15  # rising ahead
@@ -150,7 +149,7 @@ class Walk:
     velocity: Array
     commanded: Array
     heading: Array
-    contact: NDArray[np.bool_]
+    contact: Bools
     targets: Array
     joint_velocity: Array
     torque: Array

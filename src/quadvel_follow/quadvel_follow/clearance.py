@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
 
 CELL_SIZE_M = 0.05
 HALF_SIZE_M = 4.0  # from the centre of the grid to its edge

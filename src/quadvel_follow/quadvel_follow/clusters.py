@@ -6,8 +6,7 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from quadvel_description.arrays import Array, Bools, Indices
 
 MIN_RANGE_M = 0.02
 """A smaller range means that there was no echo."""
@@ -155,7 +154,7 @@ def find_clusters(scan: Scan) -> Clusters:
     return Clusters(centre[real], count[real], spacing[real], width[real])
 
 
-def _starts_cluster(scan: Scan, rays: Indices) -> NDArray[np.bool_]:
+def _starts_cluster(scan: Scan, rays: Indices) -> Bools:
     """Return whether each reading starts a cluster; the last reading precedes the first."""
     reading, points = scan.ranges[rays], scan.points(rays)
     skipped = (rays - np.roll(rays, 1)) % scan.ranges.size

@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
+
+from quadvel_description.arrays import Array
 
 from .rollouts import STEP_S, STEPS, Limits
-
-Array = NDArray[np.float64]
 
 COARSE_WINDOW = np.array([1.0, 0.4, 1.2])  # half size: m/s, m/s, rad/s around the command
 FINE_WINDOW = 0.25 * COARSE_WINDOW

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
+
+from quadvel_description.arrays import Array
 
 from .clearance import Clearance, outline_distance
 from .clusters import Scan
 from .free_space import to_sensor
 from .rollouts import TIMES_S, Limits, Rollouts
-
-Array = NDArray[np.float64]
 
 VELOCITY_FADE_S = 2.0
 """Time constant with which the predicted velocity of the followed person fades."""

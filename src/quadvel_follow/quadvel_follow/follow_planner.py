@@ -12,7 +12,9 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from quadvel_description.arrays import Array
 
 from .clearance import Clearance
 from .clusters import Scan
@@ -23,8 +25,6 @@ from .pose_history import PoseHistory
 from .pursuit import pursue
 from .rollouts import STEPS, TIMES_S, Axes, Limits, Rollouts, roll_out
 from .trail import Trail
-
-Array = NDArray[np.float64]
 
 PERIOD_S = 0.05
 """Time between two steps."""

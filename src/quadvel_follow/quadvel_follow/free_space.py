@@ -8,12 +8,10 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
+
+from quadvel_description.arrays import Array, Bools
 
 from .clusters import LEG_WIDTH_M, Scan
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 SIDE_OFFSETS_M = np.array([-0.15, -0.075, 0.0, 0.075, 0.15])
 """Lateral offsets that are checked at a place."""
@@ -59,7 +57,7 @@ def to_sensor(points: Array, pose: Array) -> Array:
     return (points - pose[:2]) @ np.array([[c, -s], [s, c]])
 
 
-def check_places(scan: Scan, points: Array, sideways: Array = SIDE_OFFSETS_M) -> tuple[Flags, Flags]:
+def check_places(scan: Scan, points: Array, sideways: Array = SIDE_OFFSETS_M) -> tuple[Bools, Bools]:
     """Check whether a scan shows that places are empty or occupied.
 
     Neither holds if the place is hidden, if the rays are too far apart, or outside the field of

@@ -7,11 +7,11 @@ from pathlib import Path
 import attrs
 import numpy as np
 import onnxruntime
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from quadvel_description.arrays import Array
 
 from .clusters import FEATURE_COUNT, MAX_CLUSTER_WIDTH_M, Scan, cluster_features, find_clusters
-
-Array = NDArray[np.float64]
 
 SHIPPED_MODEL = Path(__file__).parent / "models" / "legs.onnx"
 LEG_PROBABILITY = 0.55

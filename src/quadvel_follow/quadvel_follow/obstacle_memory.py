@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quadvel_description.arrays import Array
+
 from .clusters import Scan
 from .free_space import to_frame, to_sensor
-
-Array = NDArray[np.float64]
 
 CELL_SIZE_M = 0.05
 MAX_RANGE_M = 5.0

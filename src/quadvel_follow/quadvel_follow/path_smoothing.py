@@ -11,10 +11,9 @@ import itertools
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_smoothing_spline
 
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
 
 FEW_POINTS = 12
 """With fewer points no noise is estimated: these are hand-written corners."""

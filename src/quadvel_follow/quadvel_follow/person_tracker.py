@@ -14,15 +14,15 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
+
+from quadvel_description.arrays import Array, Bools
 
 from .clusters import Scan
 from .free_space import MEMORY_S, MIN_AGE_S, ScanHistory, check_places, to_frame, to_sensor
 from .leg_detector import LegDetector
 from .scan_motion import ScanOdometry
-
-Array = NDArray[np.float64]
 
 GATE_CHI2 = 13.8
 """Gate of the squared Mahalanobis distance in the plane: one leg in 1000 exceeds it."""
@@ -164,7 +164,7 @@ class _Legs:
 
     position: Array
     probability: Array
-    merged: NDArray[np.bool_]
+    merged: Bools
     empty: Array
     occupied: Array
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_description.kinematics import yaw
-
-Array = NDArray[np.float64]
 
 
 def planar_pose(pose: Any) -> tuple[float, float, float]:

@@ -6,9 +6,8 @@ from bisect import bisect_left
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
 
 MAX_AGE_S = 3.0
 """Time for which poses are kept."""

@@ -6,11 +6,10 @@ They ignore obstacles; the search rates them.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from quadvel_description.arrays import Array
 
 from .rollouts import STEP_S, STEPS, Limits
-
-Array = NDArray[np.float64]
 
 LANE_OFFSETS_M = np.array([0.0, 0.12, -0.12, 0.25, -0.25, 0.45, -0.45, 0.8, -0.8])
 """Lateral offsets of the lanes from the straight line, positive to the left."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
+
 Axes = tuple[float, float, float]
 
 STEP_S = 0.125

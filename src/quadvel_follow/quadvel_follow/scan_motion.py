@@ -7,13 +7,12 @@ the rotation in which the ranges agree best.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+
+from quadvel_description.arrays import Array
 
 from .clusters import Scan
 from .free_space import to_frame
-
-Array = NDArray[np.float64]
 
 RESTING_SHARE = 0.7
 """Share of rays with unchanged ranges from which the scanner rests."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
 
 POINT_SPACING_M = 0.15
 """Distance between two points."""

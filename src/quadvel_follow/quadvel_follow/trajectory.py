@@ -9,11 +9,11 @@ from xml.etree import ElementTree
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from quadvel_description.arrays import Array
 
 from .path_smoothing import EXACT_NOISE_M, FEW_POINTS, NoiseLimits, smooth_path, turn_angles
-
-Array = NDArray[np.float64]
 
 STEP_S = 0.02
 """Time between the rows of a trajectory."""

@@ -15,17 +15,15 @@ from typing import Any, Protocol
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_description import robot
+from quadvel_description.arrays import Array
 from quadvel_description.bounded_yaml import read_yaml
 from quadvel_description.state import RobotState
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.simulator import DT, Simulator
-
-Array = NDArray[np.float64]
 
 
 class HiddenPhysics(Protocol):

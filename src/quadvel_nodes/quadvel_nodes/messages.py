@@ -13,8 +13,8 @@ from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_description.state import JointCommand, RobotState
 
 QUATERNION_TOLERANCE = 0.05
@@ -61,7 +61,7 @@ def seconds(stamp: Any) -> float:
     return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
-def numbers(message: Any, field: str, size: int) -> NDArray[np.float64]:
+def numbers(message: Any, field: str, size: int) -> Array:
     """Read one field of a message as an array of finite numbers.
 
     Args:
@@ -91,7 +91,7 @@ class _NumericFields:
         self._fields, self._sizes = tuple(sizes), list(sizes.values())
         self._slices = [slice(*ends) for ends in pairwise(accumulate(self._sizes, initial=0))]
 
-    def read(self, message: Any) -> list[NDArray[np.float64]]:
+    def read(self, message: Any) -> list[Array]:
         """Return the array of each field; raise MessageError as `numbers` does."""
         values = [getattr(message, field) for field in self._fields]
         block = np.concatenate(values, dtype=np.float64)

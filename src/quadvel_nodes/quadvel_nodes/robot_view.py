@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import TransformStamped
-from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu, JointState
@@ -19,6 +18,7 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
 from quadvel_description import robot
+from quadvel_description.arrays import Array
 from quadvel_description.frames import IMU, Placed, fixed_links, moving_links
 from quadvel_description.state import RobotState
 from quadvel_description.urdf import urdf
@@ -98,7 +98,7 @@ def transform_messages(stamp: Any, placed: Sequence[Placed]) -> list[Any]:
     return messages
 
 
-def fill_vector(message: Any, vector: NDArray[np.float64]) -> None:
+def fill_vector(message: Any, vector: Array) -> None:
     """Fill a geometry_msgs Vector3 or Point.
 
     Args:
@@ -108,7 +108,7 @@ def fill_vector(message: Any, vector: NDArray[np.float64]) -> None:
     message.x, message.y, message.z = vector.tolist()
 
 
-def fill_quaternion(message: Any, wxyz: NDArray[np.float64]) -> None:
+def fill_quaternion(message: Any, wxyz: Array) -> None:
     """Fill a geometry_msgs/Quaternion.
 
     Args:
@@ -118,5 +118,5 @@ def fill_quaternion(message: Any, wxyz: NDArray[np.float64]) -> None:
     message.w, message.x, message.y, message.z = wxyz.tolist()
 
 
-def _covariance(deviation: float) -> NDArray[np.float64]:
+def _covariance(deviation: float) -> Array:
     return np.diag(np.full(3, deviation**2)).ravel()

@@ -6,13 +6,12 @@ from typing import Protocol
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quadvel_description.arrays import Array
 from quadvel_description.kinematics import rotate_inverse
 from quadvel_description.robot import GRAVITY
 from quadvel_description.state import RobotState
-
-Array = NDArray[np.float64]
 
 REST_ACCELERATION = np.array([0.0, 0.0, GRAVITY])
 """Reading of an accelerometer at rest, world frame, m/s^2."""

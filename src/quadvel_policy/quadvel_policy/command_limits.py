@@ -10,15 +10,13 @@ from collections import Counter
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_description.command_range import clip_to_command_range, split_target
 from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 
 from .settings import setting
-
-Array = NDArray[np.float64]
 
 LIMITS = {
     "target_out_of_range": "A target lies beyond the command range: it is clamped, and the rest is sent as torque.",

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
+
 MAX_RAMP_STEP_S = 0.05
 """Largest time step of the ramp, so that the command does not jump after a stall."""
 Axes = tuple[float, float, float]

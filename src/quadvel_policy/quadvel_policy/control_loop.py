@@ -19,8 +19,9 @@ from collections.abc import Callable
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quadvel_description.arrays import Array
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_nodes.messages import MessageError
 from quadvel_nodes.scheduling import Scheduling
@@ -34,8 +35,6 @@ from .received import StampCheck
 from .settings import setting
 from .stall_detector import StallDetector
 from .supervisor import Supervisor, SupervisorConfig
-
-Array = NDArray[np.float64]
 
 PERIOD_S = 1.0 / RATE_HZ
 WATCH_PERIOD_S = 0.02

@@ -13,15 +13,13 @@ from functools import cached_property
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array, Bools
 from quadvel_description.robot import LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_nodes.messages import MessageError
 
 from .settings import setting
-
-Array = NDArray[np.float64]
 
 MOVING_MODES = ("stand_up", "stance", "walk", "lie_down")
 """Modes in which the joints do more than brake."""
@@ -127,7 +125,7 @@ class MotorStatus:
     """
 
     temperature: Array
-    dropped_out: NDArray[np.bool_]
+    dropped_out: Bools
 
 
 @attrs.define

@@ -12,12 +12,13 @@ import math
 import numpy as np
 from typing_extensions import override
 
+from quadvel_description.arrays import Array
 from quadvel_description.kinematics import rotate
 from quadvel_description.robot import GRAVITY, JOINT_NAMES, LEGS, LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_nodes.messages import QUATERNION_TOLERANCE, BackInTimeError, NotFiniteError, NotUnitError
 
-from .guard import MOVING_MODES, WALK_MODES, Array, Guard, GuardInput, Level
+from .guard import MOVING_MODES, WALK_MODES, Guard, GuardInput, Level
 
 ENCODER_WINDOW_S = 0.1  # window in which angles and speeds of the joints must agree
 GYRO_WINDOW_S = 0.2  # window in which orientation and angular velocity must agree

@@ -14,12 +14,11 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_description.kinematics import foot_positions, inverse_kinematics, rotate_inverse
 from quadvel_description.state import JointCommand, RobotState
 
 from .observation import JOINTS, PolicyMetadata, build_observation
-
-Array = NDArray[np.float64]
 
 LEAN_FILTER_S = 1.0
 """Time constant of the lean; a shorter one amplifies the sway of a standing robot (decision 50)."""

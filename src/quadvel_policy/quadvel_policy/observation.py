@@ -15,6 +15,7 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_description.kinematics import roll_pitch as roll_pitch_of
 from quadvel_description.network_input import InputLayout as ObservationSpec
 from quadvel_description.network_input import InputTerm as ObservationTerm
@@ -116,7 +117,7 @@ def _metadata_error(field: str, found: object, expected: str) -> MetadataError:
     return MetadataError(f"metadata field {field} is {shown}, expected {expected}")
 
 
-def _finite_array(value: Any) -> NDArray[np.float64]:
+def _finite_array(value: Any) -> Array:
     """Return `value` as an array of finite numbers, empty if it is something else."""
     if isinstance(value, bool | str):
         return np.empty(0)
@@ -415,7 +416,7 @@ class ActionMap:
         self.scale = np.array(_per_joint("action_scale", scale))
         self.clip = _bounds("action_clip", clip)
 
-    def targets(self, action: ArrayLike) -> NDArray[np.float64]:
+    def targets(self, action: ArrayLike) -> Array:
         """Convert a network output to joint targets.
 
         Args:
@@ -426,5 +427,5 @@ class ActionMap:
         """
         if self.clip is not None:
             action = np.clip(action, *self.clip)
-        targets: NDArray[np.float64] = self.offset + self.scale * np.asarray(action)
+        targets: Array = self.offset + self.scale * np.asarray(action)
         return targets

@@ -6,11 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_nodes.messages import BackInTimeError, MessageError, NotFiniteError
-
-Array = NDArray[np.float64]
 
 
 class StampCheck:

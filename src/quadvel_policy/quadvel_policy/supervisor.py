@@ -13,6 +13,7 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quadvel_description.arrays import Array
 from quadvel_description.robot import JOINT_NAMES, LIE_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_nodes.messages import MessageError, NotFiniteError
@@ -31,7 +32,7 @@ from .guard import (
     MotorStatus,
 )
 from .guards import GUARDS, AccelerometerImplausible, DuplicatePublisher, EstimateStale, EstimateWrong
-from .modes import Array, Damping, Mode, ModeInput, Policy, Posture, Walk
+from .modes import Damping, Mode, ModeInput, Policy, Posture, Walk
 from .settings import setting
 
 MODES = ("passive", "stand_up", "stance", "walk", "lie_down", "fault")

@@ -10,9 +10,8 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
 
 
 def numbers(count: int, low: float = -np.inf) -> dict[str, Any]:

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_description import robot
+from quadvel_description.arrays import Array
 from quadvel_sim.checks import number, numbers, whole_number
 from quadvel_sim.physics import Physics
 from quadvel_sim.terrain import Terrain
@@ -76,12 +76,12 @@ class SimulatorConfig:
     world: World | None = None
     noise: SensorNoise = attrs.field(factory=SensorNoise)
     seed: int = attrs.field(default=0, **whole_number())
-    friction: NDArray[np.float64] = attrs.field(default=0.8, **numbers(4, low=0.0))
+    friction: Array = attrs.field(default=0.8, **numbers(4, low=0.0))
     payload: float = attrs.field(default=0.0, **number(-8.0, 50.0))
-    payload_position: NDArray[np.float64] = attrs.field(default=(0.0, 0.0, 0.1), **numbers(3))
-    armature: NDArray[np.float64] = attrs.field(factory=lambda: robot.ARMATURE, **numbers(12, low=1e-4))
-    joint_friction: NDArray[np.float64] = attrs.field(factory=lambda: robot.FRICTION, **numbers(12, low=0.0))
-    joint_damping: NDArray[np.float64] = attrs.field(factory=lambda: robot.DAMPING, **numbers(12, low=0.0))
+    payload_position: Array = attrs.field(default=(0.0, 0.0, 0.1), **numbers(3))
+    armature: Array = attrs.field(factory=lambda: robot.ARMATURE, **numbers(12, low=1e-4))
+    joint_friction: Array = attrs.field(factory=lambda: robot.FRICTION, **numbers(12, low=0.0))
+    joint_damping: Array = attrs.field(factory=lambda: robot.DAMPING, **numbers(12, low=0.0))
     physics: Physics = attrs.field(factory=Physics)
     suspended: bool = False
     watchdog: float = attrs.field(default=0.02, **number(0.001))

@@ -8,11 +8,9 @@ from __future__ import annotations
 import attrs
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_sim.checks import number, numbers, whole_number
-
-Array = NDArray[np.float64]
 
 LASER_VISIBLE_GROUP = 2
 """MuJoCo group of the geoms that a laser sees; links of the robot and low patches are in others."""

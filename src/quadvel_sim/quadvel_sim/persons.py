@@ -11,13 +11,11 @@ from collections.abc import Sequence
 import attrs
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_sim.laser import LASER_VISIBLE_GROUP
 from quadvel_sim.walker import Walker
 from quadvel_sim.world import Person, World
-
-Array = NDArray[np.float64]
 
 UPDATE_PERIOD_MS = 10
 """Simulated time between two positions of a person."""

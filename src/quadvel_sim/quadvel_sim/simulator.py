@@ -18,10 +18,11 @@ from types import MappingProxyType
 import attrs
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quadvel_actuator import ActuatorModel
 from quadvel_description import robot
+from quadvel_description.arrays import Array, Bools
 from quadvel_description.kinematics import rotate, rotate_inverse
 from quadvel_description.mjcf import Plant, build_spec
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
@@ -37,7 +38,7 @@ DT = 0.001
 """Time step, s."""
 _TICK_MODULUS = 2**32
 _PAYLOAD_RADIUS_M = 0.05  # the payload is a solid sphere: I = 2/5 m r^2
-_Array = NDArray[np.float64]
+_Array = Array
 # q, kp, kd, dq, tau: arguments of ActuatorModel.step
 _CommandArrays = tuple[_Array, _Array, _Array, _Array | float, _Array | float]
 
@@ -63,7 +64,7 @@ class Truth:
     quaternion: _Array
     linear_velocity: _Array
     angular_velocity: _Array
-    contact: NDArray[np.bool_]
+    contact: Bools
     contact_force: _Array
 
 

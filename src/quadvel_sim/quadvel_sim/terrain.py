@@ -10,8 +10,9 @@ from functools import cached_property
 import attrs
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quadvel_description.arrays import Array
 from quadvel_sim.checks import number, whole_number
 
 KINDS = ("flat", "slope", "rough")
@@ -22,9 +23,7 @@ _HILL_SPACING_M = 8.0  # of the lattice of hills
 _BASE_THICKNESS_M = 0.5  # of solid ground below the lowest point
 
 
-def perlin(
-    x: NDArray[np.float64], y: NDArray[np.float64], wavelength: float, seed: int
-) -> NDArray[np.float64]:
+def perlin(x: Array, y: Array, wavelength: float, seed: int) -> Array:
     """Compute 2-D gradient noise with quintic fade.
 
     K. Perlin, Improving noise, ACM Transactions on Graphics 21 (3), 2002.
@@ -46,14 +45,14 @@ def perlin(
     angles = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (row.max() + 2, column.max() + 2))
     u, v = u - column, v - row
 
-    def corner(i: int, j: int) -> NDArray[np.float64]:
+    def corner(i: int, j: int) -> Array:
         angle = angles[row + i, column + j]
         return np.asarray(np.cos(angle) * (u - j) + np.sin(angle) * (v - i))
 
     blend_x, blend_y = (t**3 * (t * (6.0 * t - 15.0) + 10.0) for t in (u, v))
     low = corner(0, 0) + blend_x * (corner(0, 1) - corner(0, 0))
     high = corner(1, 0) + blend_x * (corner(1, 1) - corner(1, 0))
-    noise: NDArray[np.float64] = np.sqrt(2.0) * (low + blend_y * (high - low))
+    noise: Array = np.sqrt(2.0) * (low + blend_y * (high - low))
     return noise
 
 
@@ -94,7 +93,7 @@ class Terrain:
             raise ValueError(f"Terrain.slope: found {self.slope} rad with kind 'flat', expected 0")
 
     @cached_property
-    def _heights(self) -> NDArray[np.float64]:
+    def _heights(self) -> Array:
         """Heights of the grid, m; rows along y, columns along x."""
         points = round(self.size / _GRID_SPACING_M) + 1
         axis = np.linspace(0.0, self.size, points)
@@ -106,11 +105,11 @@ class Terrain:
         return np.asarray(x * np.tan(self.slope) + grown * (bumps + hills))
 
     @property
-    def tilt(self) -> NDArray[np.float64]:
+    def tilt(self) -> Array:
         """Orientation of the ground at the origin, ground to world, (4,), (w, x, y, z)."""
         return np.array([np.cos(0.5 * self.slope), 0.0, -np.sin(0.5 * self.slope), 0.0])
 
-    def height(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
+    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Interpolate the height of the ground as MuJoCo's height field does.
 
         Args:
@@ -133,7 +132,7 @@ class Terrain:
         below, above = u * (right - here) + v * (far - right), v * (up - here) + u * (far - up)
         return np.asarray(here + np.where(u > v, below, above))
 
-    def triangles(self, size: float, step: float) -> NDArray[np.float64]:
+    def triangles(self, size: float, step: float) -> Array:
         """Return the ground in a square about the origin as triangles for display.
 
         Args:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
 
 STANCE_FRACTION = 0.6
 """Share of a stride in which a foot stands."""

@@ -15,14 +15,13 @@ from typing import Any
 import attrs
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quadvel_description.arrays import Array
 from quadvel_description.bounded_yaml import read_yaml
 from quadvel_sim.checks import number, numbers, one_of, or_none, points, truth_value, whole_number
 from quadvel_sim.laser import LASER_VISIBLE_GROUP, Laser
 from quadvel_sim.terrain import GEOM_NAME, perlin
-
-Array = NDArray[np.float64]
 
 SCHEMA = 1
 WORLDS_FOLDER = Path(__file__).parent / "worlds"
@@ -461,7 +460,7 @@ class World:
         laser: Laser on the robot.
         walls: Walls.
         boxes: Boxes.
-        trees: Groups of trees.
+        trees: Indices of trees.
         tables: Tables.
         patches: Patches of grass or gravel.
         hills: Hills.

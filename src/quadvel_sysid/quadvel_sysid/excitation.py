@@ -13,14 +13,13 @@ from typing import Any, ClassVar
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from typing_extensions import override
 
 from quadvel_description import robot
+from quadvel_description.arrays import Array
 from quadvel_description.command_range import clip_to_command_range
 from quadvel_description.kinematics import HIPS, foot_jacobians, inverse_kinematics
-
-Array = NDArray[np.float64]
 
 PERIOD_S = 0.001
 """s between two targets."""

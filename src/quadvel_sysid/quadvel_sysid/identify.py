@@ -12,16 +12,16 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
 from quadvel_actuator.parameters import ActuatorParameters
+from quadvel_description.arrays import Array, Bools, Indices
 
 from .data.identification_data import MAX_TORQUE_VALUES, IdentificationData, Progress, prepare
 from .data.motion import STRETCH_S, Body, Replay, replay_errors
 from .data.noise import noise_variance
 from .data.plain_model import DRIVE_WINDOWS_S, pd_torque
 from .data.preparation import MIN_BLOCK_S, Preprocessed, preprocess
-from .data.signals import Array, Bools, Samples
+from .data.signals import Samples
 from .data.split import DataSplit
 from .export.export_parameters import actuator_parameters
 from .export.replay import EXPLANATION as LEG_TEXT
@@ -163,7 +163,7 @@ def _load_legs(robot: str, data: IdentificationData) -> Legs:
     return Legs.load(robot, data.logs[0].joints)
 
 
-def _search_rows(preprocessed: Preprocessed) -> tuple[Samples, NDArray[np.intp]]:
+def _search_rows(preprocessed: Preprocessed) -> tuple[Samples, Indices]:
     """The samples that the search uses, and their row numbers; without held-out logs."""
     samples = preprocessed.samples.drop_heldout(preprocessed.parts.fit_or_select)
     step = min(round(samples.tau.size / _SEARCH_VALUES), round(_MAX_SEARCH_STEP_S / samples.period))

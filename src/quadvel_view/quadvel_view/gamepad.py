@@ -18,11 +18,10 @@ from collections.abc import Callable, Collection, Mapping
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
+
+from quadvel_description.arrays import Array
 
 from .keyboard import FIRST_STEP, MAX_TURN_RAD_S, SIDEWAYS_SHARE, SPEED_STEPS_M_S, TURN_PER_SPEED
-
-Array = NDArray[np.float64]
 
 # Of linux/input-event-codes.h.
 SYNCHRONISATION, KEY, ABSOLUTE = 0, 1, 3

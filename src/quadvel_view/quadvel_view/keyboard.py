@@ -12,9 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
 
 KEY_DIRECTIONS = {
     "w": (1.0, 0.0, 0.0),

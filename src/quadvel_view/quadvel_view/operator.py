@@ -10,9 +10,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
 
 HOLD_TIMEOUT_S = 0.4
 """Time without a repeat after which a hold ends; repeats come at 20 Hz, but a browser may stall."""

@@ -8,12 +8,10 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
 from quadvel_description import robot
+from quadvel_description.arrays import Array
 from quadvel_description.kinematics import foot_positions, rotate
-
-Array = NDArray[np.float64]
 
 TOPICS = {
     "/joint_states": "sensor_msgs/msg/JointState",

@@ -8,8 +8,8 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_recordings.reading import RecordingError, lazy_messages
 
 from .picture import LOW_STATE, TOPICS, RobotPicture
@@ -33,7 +33,7 @@ class _Track:
         messages: Functions that deserialise them.
     """
 
-    times: NDArray[np.float64]
+    times: Array
     messages: list[Callable[[], Any]]
 
     def between(self, after: float, until: float) -> list[Callable[[], Any]]:

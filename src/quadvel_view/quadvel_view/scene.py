@@ -13,15 +13,14 @@ import attrs
 import numpy as np
 import trimesh
 import viser
-from numpy.typing import NDArray
 
 from quadvel_description import robot
+from quadvel_description.arrays import Array
 from quadvel_description.frames import moving_links
 from quadvel_description.urdf import urdf
 
 from .picture import Ground, Person, RobotPicture
 
-Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 TRUNK, LEG, FOOT = (226, 230, 236), (84, 93, 107), (255, 128, 48)

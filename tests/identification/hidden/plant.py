@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
+
 Step = Callable[[int, float], float]
 
 GRAVITY = 9.81

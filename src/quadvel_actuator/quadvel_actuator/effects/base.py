@@ -14,10 +14,9 @@ from typing import Any, ClassVar, Protocol
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from quadvel_description.arrays import Array, Bools, Indices
+
 Params = Mapping[str, Array]
 Errors = tuple[Array, Array]
 """Errors that enter the PD law: q_des - q (rad) and dq_des - dq (rad/s)"""
@@ -561,7 +560,7 @@ def evaluate_distinct(function: Callable[..., Array], *parameters: Array) -> Arr
     return function(*(one[first] if np.ndim(one) == 3 else one for one in parameters))[which]
 
 
-def distinct_indices(batch: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def distinct_indices(batch: Array) -> tuple[Indices, Indices]:
     """Find the distinct elements of a batch.
 
     Args:

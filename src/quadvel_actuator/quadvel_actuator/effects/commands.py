@@ -9,7 +9,9 @@ import attrs
 import numpy as np
 from typing_extensions import override
 
-from .base import Array, ErrorLaw, Errors, InitialGuess, Memory, MemoryLaw, Parameter, Params, Stage, View
+from quadvel_description.arrays import Array
+
+from .base import ErrorLaw, Errors, InitialGuess, Memory, MemoryLaw, Parameter, Params, Stage, View
 
 MAX_BACKLOG = 6
 """Largest number of commands lost in a row that is considered"""

@@ -10,11 +10,12 @@ import numpy as np
 from scipy.linalg.blas import dtbsv
 from typing_extensions import override
 
+from quadvel_description.arrays import Array
+
 from .base import (
     DRIVE,
     JOINT,
     AddedLaw,
-    Array,
     ErrorLaw,
     Errors,
     InitialGuess,

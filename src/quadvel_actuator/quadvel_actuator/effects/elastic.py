@@ -9,11 +9,11 @@ import attrs
 import numpy as np
 from typing_extensions import override
 
+from quadvel_description.arrays import Array, Bools
+
 from . import recurrence
 from .base import (
     AddedLaw,
-    Array,
-    Bools,
     EffectLaw,
     ErrorLaw,
     Errors,

@@ -12,9 +12,10 @@ import attrs
 import numpy as np
 from typing_extensions import override
 
+from quadvel_description.arrays import Array
+
 from .base import (
     AddedLaw,
-    Array,
     EffectLaw,
     InitialGuess,
     Parameter,

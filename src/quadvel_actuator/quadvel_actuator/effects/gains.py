@@ -9,12 +9,12 @@ import attrs
 import numpy as np
 from typing_extensions import override
 
+from quadvel_description.arrays import Array, Bools
+
 from .base import (
     DRIVE,
     JOINT,
     AddedLaw,
-    Array,
-    Bools,
     EffectLaw,
     InitialGuess,
     Memory,

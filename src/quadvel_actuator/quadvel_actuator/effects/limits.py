@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
+from quadvel_description.arrays import Array
+
 from . import recurrence
-from .base import Array, EffectLaw, InitialGuess, Memory, MemoryLaw, Parameter, Params, Stage, TorqueLaw, View
+from .base import EffectLaw, InitialGuess, Memory, MemoryLaw, Parameter, Params, Stage, TorqueLaw, View
 
 _SATURATING_MOTION = "fast and large steps that ask for more torque than the drive gives"
 

@@ -18,11 +18,12 @@ from typing import Any, ClassVar
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 from typing_extensions import override
 
-from .base import DRIVE, JOINT, Array, Memory, View, smooth_sign
+from quadvel_description.arrays import Array, Bools, Indices
+
+from .base import DRIVE, JOINT, Memory, View, smooth_sign
 
 LEARNED_RESIDUAL = "learned_residual"
 """Name of terms in reports and parameter files"""
@@ -66,7 +67,7 @@ class Shape(ABC):
         return 1e-5 * np.eye(self.count)
 
     @abstractmethod
-    def columns(self, u: Array, start: NDArray[np.bool_], dt: float) -> Array:
+    def columns(self, u: Array, start: Bools, dt: float) -> Array:
         """Evaluate the basis functions over a series.
 
         Args:
@@ -104,7 +105,7 @@ class Shape(ABC):
             Sum of the basis functions times their weights, (..., J), and the new memory.
         """
 
-    def for_columns(self, columns: NDArray[np.intp]) -> Shape:
+    def for_columns(self, columns: Indices) -> Shape:
         """Select columns of the signal.
 
         Args:
@@ -159,7 +160,7 @@ class Curve(Shape):
         penalty: Array = 100.0 * bend.T @ bend + 1e-3 * np.eye(self.count)
         return penalty
 
-    def _basis_at(self, u: Array) -> tuple[NDArray[np.intp], list[Array]]:
+    def _basis_at(self, u: Array) -> tuple[Indices, list[Array]]:
         """Return the first of the four basis functions that are not 0 at `u`, and their values."""
         x = np.clip((u - self.low) / (self.high - self.low), 0.0, 1.0) * self.pieces
         first = np.minimum(x.astype(np.intp), self.pieces - 1)
@@ -177,7 +178,7 @@ class Curve(Shape):
         ]
 
     @override
-    def columns(self, u: Array, start: NDArray[np.bool_], dt: float) -> Array:
+    def columns(self, u: Array, start: Bools, dt: float) -> Array:
         first, values = self._basis_at(u)
         rows, count = u.shape
         out = np.zeros(rows * self.count * count)
@@ -219,7 +220,7 @@ class Wave(Shape):
         return [*(np.sin(a) for a in angles), *(np.cos(a) for a in angles)]
 
     @override
-    def columns(self, u: Array, start: NDArray[np.bool_], dt: float) -> Array:
+    def columns(self, u: Array, start: Bools, dt: float) -> Array:
         return np.stack(self._basis(u), axis=1)
 
     @override
@@ -251,7 +252,7 @@ class Filter(Shape):
         return [(near, max(far, near + 1)) for near, far in pairwise(rows)]
 
     @override
-    def columns(self, u: Array, start: NDArray[np.bool_], dt: float) -> Array:
+    def columns(self, u: Array, start: Bools, dt: float) -> Array:
         # Sliding means from a cumulative sum; the signal counts as constant before its stretch
         # began.
         n = np.arange(len(u))
@@ -295,7 +296,7 @@ class Lag(Shape):
         return 2
 
     @override
-    def columns(self, u: Array, start: NDArray[np.bool_], dt: float) -> Array:
+    def columns(self, u: Array, start: Bools, dt: float) -> Array:
         # Exact pole, trapezoidal input: z[k] = d z[k-1] + (1 - d) (u[k-1] + u[k]) / 2, d = exp(-dt
         # / T)
         kept = float(np.exp(-dt / self.time))
@@ -348,7 +349,7 @@ class Resonance(Shape):
         return factor, (factor - 1.0) / pole * size
 
     @override
-    def columns(self, u: Array, start: NDArray[np.bool_], dt: float) -> Array:
+    def columns(self, u: Array, start: Bools, dt: float) -> Array:
         factor, gain = self._discretised(dt)
         z = np.empty(u.shape, dtype=complex)
         edges = [*np.flatnonzero(start), len(u)]
@@ -437,7 +438,7 @@ class Term:
     signal: str
     times: str
     shape: Shape
-    active: NDArray[np.bool_]
+    active: Bools
     weights: Array
     bound: Array
     at: str = DRIVE
@@ -621,7 +622,7 @@ class RunningTerms:
         self.terms, self._joints, self._dt = terms, joints, dt
         self.memory: tuple[Memory, ...] = ()
 
-    def step(self, tau: Array, now: View, new: NDArray[np.bool_] | None) -> Array | float:
+    def step(self, tau: Array, now: View, new: Bools | None) -> Array | float:
         """Advance all terms by one step.
 
         Args:

@@ -9,6 +9,7 @@ from typing import Any
 import attrs
 import numpy as np
 
+from quadvel_description.arrays import Array
 from quadvel_description.robot import LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING
 from quadvel_estimator.learned import LearnedEstimator
@@ -19,7 +20,7 @@ from quadvel_sim.simulator import DT, Simulator
 from ..pool import Call, run_in_parallel
 from .cases import CASES, Case
 from .injection import make_injection
-from .stack import Array, Stack
+from .stack import Stack
 
 SCHEMA = 1
 OBSERVATION_TIME_S = 2.5  # after the fault

@@ -9,8 +9,8 @@ from typing import Any
 import attrs
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array, Bools
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import RobotState
 from quadvel_sim.simulator import DT
@@ -176,7 +176,7 @@ def _sensor(fields: tuple[str, ...], kind: str, one_joint: bool = False) -> Call
 class _Sensor:
     """Sensor fault: replaces some values of each state."""
 
-    def __init__(self, kind: str, places: dict[str, NDArray[np.bool_]], rng: Rng) -> None:
+    def __init__(self, kind: str, places: dict[str, Bools], rng: Rng) -> None:
         self._kind, self._places, self._rng = kind, places, rng
         self._past: list[tuple[int, RobotState]] = []
 
@@ -188,7 +188,7 @@ class _Sensor:
         }
         return attrs.evolve(state, **values)
 
-    def _value(self, field: str, now: int, true: NDArray[np.float64]) -> Any:
+    def _value(self, field: str, now: int, true: Array) -> Any:
         """Faulty value of a field."""
         kind, begun = self._kind, self._past[0]
         if kind == "off" or (kind == "intermittent" and self._rng.random() < 0.3):
@@ -217,7 +217,7 @@ GARBAGE = {
 MOUNTING_TILT = np.array([np.cos(0.25), np.sin(0.25), 0.0, 0.0])
 
 
-def _wrong(field: str, true: NDArray[np.float64]) -> NDArray[np.float64]:
+def _wrong(field: str, true: Array) -> Array:
     """Add an offset to a field; the orientation gets a wrong mounting (Hamilton product with a tilt)."""
     if field == "quaternion":
         # Hamilton product q * (a, b, 0, 0): rotation by 2 acos(a) about the body's x axis.

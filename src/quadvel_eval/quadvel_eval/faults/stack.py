@@ -13,8 +13,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_driver.link import MAX_COMMAND_AGE_MS, clamp_for_board
 from quadvel_estimator.features import previous_action
@@ -38,7 +38,6 @@ from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import DT, Simulator
 
-Array = NDArray[np.float64]
 Message = Any
 
 STATE_PERIOD_MS = 5

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_follow.follow_planner import FollowConfig, FollowPlanner, Plan
 from quadvel_follow.leg_detector import LegDetector
 from quadvel_follow.person_tracker import PersonTracker, Track
 from quadvel_follow.selection import Selection
 from quadvel_sim.laser import Scan
-
-Array = NDArray[np.float64]
 
 
 class Follower:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from quadvel_description.arrays import Array
 from quadvel_follow.clearance import outline_distance
 from quadvel_follow.follow_planner import FollowConfig
 from quadvel_sim.world import World
-
-Array = NDArray[np.float64]
 
 OUTLINE_SPACING_M = 0.03  # between points of an outline
 SEARCH_RADIUS_M = 3.0  # for obstacles

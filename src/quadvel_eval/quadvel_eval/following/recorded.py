@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, State
 from quadvel_follow.planar import planar_pose, planar_twist
 from quadvel_nodes.messages import seconds
@@ -17,8 +17,6 @@ from quadvel_sim.world import World
 
 from .obstacles import Clearances
 from .tour import AVERAGING_TIME_S, Outcome, TourSample
-
-Array = NDArray[np.float64]
 
 REQUIRED_TOPICS = (
     "/command",

@@ -6,14 +6,12 @@ from collections.abc import Callable, Mapping
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quadvel_sim.walker import Walker
 
 from ..people.laser import FloorPlan
 from ..people.scenes import along_walls
-
-Array = NDArray[np.float64]
 
 INITIAL_STOP = (
     1.6,

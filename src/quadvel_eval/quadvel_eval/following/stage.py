@@ -11,8 +11,8 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_follow.clearance import outline_distance
 from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, State
 from quadvel_follow.leg_detector import LegDetector
@@ -23,8 +23,6 @@ from quadvel_sim.walker import leg_circles
 from ..people.laser import FloorPlan, Laser
 from .follower import Follower
 from .scenes import FollowScene
-
-Array = NDArray[np.float64]
 
 STEP_S = 0.01
 COMMAND_DELAY_S = 0.06  # from a command to the first motion

@@ -14,8 +14,8 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_description.kinematics import rotate, yaw
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL
@@ -32,8 +32,6 @@ from ..segments import rounded
 from .follower import Follower
 from .obstacles import Clearances
 from .stage import DISTANCE_BAND_M, SETTLING_TIME_S
-
-Array = NDArray[np.float64]
 
 AVERAGING_TIME_S = 0.35  # of compared velocities, to remove the sway of a stride
 ODOMETRY_INTERVAL_TICKS = 4  # between odometry messages

@@ -11,11 +11,11 @@ import attrs
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from typing_extensions import override
 
 from quadvel_description import robot
+from quadvel_description.arrays import Array, Bools
 
 from ..gait_kind import GaitKind, gait_frequency
 from ..robot_loop import CONTROL_PERIOD_S
@@ -35,8 +35,6 @@ from .section import (
     select,
 )
 
-Array = NDArray[np.float64]
-
 WINDOW_S = 1.0  # for gait figures
 MEDIAN_FILTER_TICKS = 5  # touches or gaps shorter than half of it are bounces
 CSV_INTERVAL_TICKS = 4  # between lines of the CSV
@@ -52,7 +50,7 @@ GAIT_KIND_FIGURES = {  # name, unit and factor in the table
 SHOWN_LEGS = ("FL", "FR", "RL", "RR")
 
 
-def debounce_contacts(raw: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def debounce_contacts(raw: Bools) -> Bools:
     """Remove short touches and gaps from foot contacts by a median filter.
 
     Args:
@@ -61,7 +59,7 @@ def debounce_contacts(raw: NDArray[np.bool_]) -> NDArray[np.bool_]:
     Returns:
         Filtered contacts (n, 4).
     """
-    steady: NDArray[np.bool_] = median_filter(raw, size=(MEDIAN_FILTER_TICKS, 1), mode="nearest")
+    steady: Bools = median_filter(raw, size=(MEDIAN_FILTER_TICKS, 1), mode="nearest")
     return steady
 
 

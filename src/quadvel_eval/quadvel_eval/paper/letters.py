@@ -8,9 +8,9 @@ from typing import ClassVar
 import attrs
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from typing_extensions import override
 
+from quadvel_description.arrays import Array
 from quadvel_follow.trajectory import SHIPPED_FOLDER, Trajectory, read_table
 
 from ..robot_loop import CONTROL_PERIOD_S
@@ -31,8 +31,6 @@ from .section import (
     select,
     walk_jobs,
 )
-
-Array = NDArray[np.float64]
 
 CSV_INTERVAL_TICKS = 10  # between lines of the CSV
 Stroke = tuple[Command, float]  # velocity in the body frame, and duration (s)

@@ -9,9 +9,9 @@ from typing import ClassVar
 import attrs
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from typing_extensions import override
 
+from quadvel_description.arrays import Array
 from quadvel_description.state import JointCommand
 
 from ..gait_kind import touchdowns
@@ -34,8 +34,6 @@ from .section import (
     select,
     walk_jobs,
 )
-
-Array = NDArray[np.float64]
 
 SETTLING_TIME_S = 1.0  # after the zero command
 ZERO_COMMAND = (0.0, 0.0, 0.0)

@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 import attrs
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from typing_extensions import override
 
 from quadvel_description import robot
+from quadvel_description.arrays import Array, Indices
 from quadvel_description.symmetry import JOINTS as MIRROR
 
 from ..gait_kind import touchdowns
@@ -20,8 +20,6 @@ from ..walk import Setup, Walk, make_loop, record_walk
 from .cells import command_limits
 from .gait import debounce_contacts
 from .section import Job, JobResults, Record, Row, Section, Study, by_policy, column, distinct, select
-
-Array = NDArray[np.float64]
 
 WALK_DURATION_S, SETTLING_TIME_S = 7.0, 3.0  # duration, and start of the evaluated part
 PHASES_PER_CYCLE = 80
@@ -43,7 +41,7 @@ def walk_forward(setup: Setup, seed: int, speed: float) -> Walk | None:
     return record_walk(make_loop(setup, seed, ()), [((speed, 0.0, 0.0), WALK_DURATION_S)])
 
 
-def resample_cycles(down: NDArray[np.intp], values: Array) -> Array:
+def resample_cycles(down: Indices, values: Array) -> Array:
     """Cut series into gait cycles and interpolate each at PHASES_PER_CYCLE even phases.
 
     Args:

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quadvel_description.arrays import Array
 from quadvel_sim.laser import Scanner
-
-Array = NDArray[np.float64]
 
 
 def _as_circles(values: ArrayLike) -> Array:

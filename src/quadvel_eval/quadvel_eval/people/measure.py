@@ -10,14 +10,12 @@ from zipfile import BadZipFile
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
 from quadvel_follow.leg_detector import LegDetector
 from quadvel_follow.person_tracker import PersonTracker, Track
 
 from .scenes import SCENES, Scene
-
-Array = NDArray[np.float64]
 
 LABEL_RADIUS_M = 0.25  # between a label and a detected leg
 SWITCH_LIMITS = (1.0, 3.0)  # m and s, between the end of a track and the start of another

@@ -6,13 +6,12 @@ from collections.abc import Callable, Iterator, Mapping
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quadvel_description.arrays import Array
 from quadvel_sim.walker import Walker, leg_circles
 
 from .laser import FloorPlan, Laser
-
-Array = NDArray[np.float64]
 
 WALKING_STEP_S = 0.01  # simulation step of the people
 RESOLUTIONS = np.deg2rad([0.25, 0.36, 0.5, 1.0])

@@ -11,9 +11,8 @@ of each command) that maps changes of slope of s to changes of slope of dq. Then
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
 
 HALF_WIDTHS_S = {"ddq": 0.002, "ddq_sharp": 0.002, "ddq_smooth": 0.008}
 """s to either side over which the slope is computed, by signal; `ddq` stays blurred, for torques

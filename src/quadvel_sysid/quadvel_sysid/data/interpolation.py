@@ -7,16 +7,14 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
+from quadvel_description.arrays import Array, Indices
 
 _MAX_LINEAR_STEPS = 16
-"""Rows of linear search before binary search."""
+"""Indices of linear search before binary search."""
 
 
-def rows_at(times: Array, at: Array) -> Rows:
+def rows_at(times: Array, at: Array) -> Indices:
     """Find the last row at or before each time.
 
     Args:
@@ -31,7 +29,7 @@ def rows_at(times: Array, at: Array) -> Rows:
     return found
 
 
-def locate(times: Array, at: Array) -> tuple[Rows, Array]:
+def locate(times: Array, at: Array) -> tuple[Indices, Array]:
     """Find the interval of rows that holds each time.
 
     Args:
@@ -46,7 +44,7 @@ def locate(times: Array, at: Array) -> tuple[Rows, Array]:
     return found, share
 
 
-def interpolate(values: Array, row: Rows, share: Array) -> Array:
+def interpolate(values: Array, row: Indices, share: Array) -> Array:
     """Interpolate linearly between rows.
 
     Args:

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array, Indices
+
 from ..logs.log import TIME_TOLERANCE_S, Log
 from . import interpolation
 from .acceleration import HALF_WIDTHS_S, local_lines, local_slope, split_acceleration
 
-Array = NDArray[np.float64]
 Joints = slice | list[int]
 ALL_JOINTS = slice(None)
 """Selects all joints."""
@@ -77,7 +78,7 @@ class LogSignals:
         self._slopes: dict[float, Array] = {}
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
 
-    def locate(self, at: Array) -> tuple[NDArray[np.intp], Array]:
+    def locate(self, at: Array) -> tuple[Indices, Array]:
         """Find the interval of state rows that holds each time.
 
         Args:
@@ -93,7 +94,7 @@ class LogSignals:
         name: str,
         at: Array,
         joints: Joints = ALL_JOINTS,
-        found: tuple[NDArray[np.intp], Array] | None = None,
+        found: tuple[Indices, Array] | None = None,
     ) -> Array:
         """Interpolate a state signal.
 
@@ -167,7 +168,7 @@ class LogSignals:
         """
         return interpolation.interpolate_shifted(self.states[name], self.t, at, late)
 
-    def command_rows(self, at: Array) -> NDArray[np.intp]:
+    def command_rows(self, at: Array) -> Indices:
         """Find the command rows in force.
 
         Args:
@@ -184,7 +185,7 @@ class LogSignals:
         at: Array,
         window: float,
         joints: Joints = ALL_JOINTS,
-        row: NDArray[np.intp] | None = None,
+        row: Indices | None = None,
     ) -> Array:
         """Read a command signal, or its mean over a step of the drive.
 

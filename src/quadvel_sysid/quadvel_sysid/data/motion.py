@@ -13,14 +13,14 @@ from collections.abc import Sequence
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
+from quadvel_description.arrays import Array, Bools, Indices
 
 from ..logs.log import Log, LogError
 from .plain_model import MAX_INPUT_DELAY_S
-from .signals import Array, Bools, Samples
+from .signals import Samples
 
 STRETCH_S = 0.05
 """s that are replayed from a measured state before the next one is used."""
@@ -56,15 +56,13 @@ class Limb:
         drift: (D, K) weights of the acceleration without torque.
     """
 
-    joints: NDArray[np.intp]
+    joints: Indices
     middle: Array
     mobility: Array
     drift: Array
 
     @classmethod
-    def fit(
-        cls, joints: NDArray[np.intp], q: Array, dq: Array, torque: Array, ddq: Array
-    ) -> tuple[Limb, float]:
+    def fit(cls, joints: Indices, q: Array, dq: Array, torque: Array, ddq: Array) -> tuple[Limb, float]:
         """Fit the dynamics to a motion.
 
         Args:
@@ -231,7 +229,7 @@ def average_over_steps(log: Log) -> tuple[Log, Array]:
     return coarse, (dq[last] - dq[first]) / dt
 
 
-def _trapezoid_mean(x: Array, first: NDArray[np.intp], count: int) -> Array:
+def _trapezoid_mean(x: Array, first: Indices, count: int) -> Array:
     """Mean over rows `first` to `first + count`, the outer two with half weight."""
     rows = [x[first + k] for k in range(count + 1)]
     mean: Array = (0.5 * (rows[0] + rows[-1]) + sum(rows[1:-1], start=np.zeros_like(rows[0]))) / count
@@ -284,7 +282,7 @@ def _fit_body(samples: Samples, ddq: Array, delay: float) -> tuple[Body, float]:
     return Body(tuple(limbs)), share
 
 
-def _group_limbs(joints: Sequence[str]) -> list[NDArray[np.intp]]:
+def _group_limbs(joints: Sequence[str]) -> list[Indices]:
     """Group joints with the same first part of the name, and split groups that are too large."""
     names = [name.partition("_")[0] for name in joints]
     groups = [np.flatnonzero([one == name for one in names]) for name in dict.fromkeys(names)]

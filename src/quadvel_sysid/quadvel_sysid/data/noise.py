@@ -7,7 +7,9 @@ from math import comb
 
 import numpy as np
 
-from .signals import Array, Bools, Samples
+from quadvel_description.arrays import Array, Bools
+
+from .signals import Samples
 
 _DIFFERENCE_ORDERS = (2, 3, 4, 5)
 _INNER_FRACTION = 0.9

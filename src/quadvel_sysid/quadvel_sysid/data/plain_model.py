@@ -13,8 +13,10 @@ from collections.abc import Iterable, Sequence
 import attrs
 import numpy as np
 
+from quadvel_description.arrays import Array, Bools
+
 from .log_signals import LogSignals
-from .signals import Array, Bools, Samples, scattered_rows
+from .signals import Samples, scattered_rows
 
 MAX_INPUT_DELAY_S, MAX_OUTPUT_DELAY_S = 0.020, 0.006
 """Upper bounds of the input and output delay, s."""

@@ -16,13 +16,12 @@ from typing import Any, TypeVar
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
+
+from quadvel_description.arrays import Array, Bools, Indices
 
 from ..logs.log import Log
 from .log_signals import ALL_JOINTS, Joints, LogSignals, as_double
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Made = TypeVar("Made")
 
 SETTLING_S = 0.03
@@ -82,9 +81,9 @@ class Signals:
     kd: Array
     temperature: Array | None
     voltage: Array | None
-    packet: NDArray[np.intp]
+    packet: Indices
     age: Array
-    row: NDArray[np.intp]
+    row: Indices
     sent: Array
     read_shifted: Callable[[str, Array], Array]
     slope: Callable[[str], Array]
@@ -127,7 +126,7 @@ class Signals:
         return self.read_shifted(name, late)
 
 
-def scattered_rows(count: int, every: int) -> NDArray[np.intp]:
+def scattered_rows(count: int, every: int) -> Indices:
     """Select one of every few rows at irregular places.
 
     At regular places, commands of an even sender would have the same age in each selected row.
@@ -140,9 +139,7 @@ def scattered_rows(count: int, every: int) -> NDArray[np.intp]:
         Row indices, increasing.
     """
     first = np.arange(0, count, every)
-    rows: NDArray[np.intp] = first + (every * np.modf(_GOLDEN_RATIO * np.arange(len(first)))[0]).astype(
-        np.intp
-    )
+    rows: Indices = first + (every * np.modf(_GOLDEN_RATIO * np.arange(len(first)))[0]).astype(np.intp)
     return rows[rows < count]
 
 
@@ -254,7 +251,7 @@ class Samples:
         part.logs, part.sent = self.logs[:count], self.sent[: self._first_packet[count]]
         return part
 
-    def thinned(self, step: int) -> tuple[Samples, NDArray[np.intp]]:
+    def thinned(self, step: int) -> tuple[Samples, Indices]:
         """Keep one of every few rows; the signals between them stay known.
 
         Args:
@@ -297,7 +294,7 @@ class Samples:
             self._selections[key] = self.take_rows(np.flatnonzero(rows))
         return self._selections[key]
 
-    def take_rows(self, rows: NDArray[np.intp]) -> Samples:
+    def take_rows(self, rows: Indices) -> Samples:
         """Keep rows by their indices, with their `dt` and `start`.
 
         Args:

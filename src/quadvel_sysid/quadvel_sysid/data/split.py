@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
-from .signals import Array, Bools, Samples
+from quadvel_description.arrays import Array, Bools, Indices
+
+from .signals import Samples
 
 CLUSTER_DURATION_S = 0.1
 """Duration, s, over which sums of residuals count as independent."""
@@ -34,7 +35,7 @@ class DataSplit:
     fit: Bools
     select: Bools
     report: Bools
-    cluster_starts: NDArray[np.intp]
+    cluster_starts: Indices
     noise_overlap: int = 0
 
     @property
@@ -47,7 +48,7 @@ class DataSplit:
         """Samples that fit or select, (N, J) bool."""
         return self.fit | self.select
 
-    def select_rows(self, rows: NDArray[np.intp]) -> DataSplit:
+    def select_rows(self, rows: Indices) -> DataSplit:
         """Restrict the split to a subset of rows.
 
         Args:
@@ -73,7 +74,7 @@ class DataSplit:
         return total
 
 
-def cluster_starts(samples: Samples) -> NDArray[np.intp]:
+def cluster_starts(samples: Samples) -> Indices:
     """Divide the rows into clusters for the tests.
 
     A cluster begins where a log begins, or when at least `CLUSTER_DURATION_S` has passed and some

@@ -10,10 +10,10 @@ import numpy as np
 
 from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
 from quadvel_actuator.parameters import ActuatorParameters, DelayPair, Effect
+from quadvel_description.arrays import Array, Bools
 from quadvel_description.robot import JOINT_NAMES
 
 from ..data.preparation import reference_gains
-from ..data.signals import Array, Bools
 from ..data.split import DataSplit
 from ..model.delays import running_delays
 from ..model.torque_model import AppliedEffect, Model, linear_columns

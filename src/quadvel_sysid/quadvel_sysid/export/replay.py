@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf
+from quadvel_description.arrays import Array, Bools
 
 from ..data.log_signals import as_double
-from ..data.signals import Array, Bools
 from ..logs.log import Log, LogError
 
 STRETCH_S = 0.2

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import attrs
 import numpy as np
 
+from quadvel_description.arrays import Bools, Floats
 from quadvel_description.robot import JOINT_NAMES
 
 from .channels import (
@@ -23,7 +24,7 @@ from .channels import (
     slope_at_rows,
 )
 from .findings import Finding, Kind, format_names
-from .log import Array, Bools, Log
+from .log import Log
 from .response import measure_response
 from .slopes import encoder_step, smooth_motion
 from .torque import lacks_sign
@@ -137,12 +138,12 @@ def unusable_speed(log: Log) -> Iterator[Finding | Log]:
             return
 
 
-def _rms(x: Array) -> Array:
+def _rms(x: Floats) -> Floats:
     """Root mean square of each column."""
     return np.asarray(np.sqrt(np.mean(x**2, axis=0)))
 
 
-def _correlation(a: Array, b: Array) -> Array:
+def _correlation(a: Floats, b: Floats) -> Floats:
     """Correlation of each column about 0; 0 if a column is 0."""
     return np.asarray(np.mean(a * b, axis=0) / (_rms(a) * _rms(b) + 1e-12))
 

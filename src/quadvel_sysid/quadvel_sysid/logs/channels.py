@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
+from quadvel_description.arrays import Bools, Floats, Indices
 from quadvel_description.robot import JOINT_NAMES, LOWER, UPPER
 
 from .findings import Finding, format_names
-from .log import Array, Bools, Log
+from .log import Log
 
 MAX_ROWS = 20_000
 """Rows that a check reads at most; they are spread evenly over the log to bound its memory."""
@@ -33,7 +33,7 @@ RANGE_MARGIN_RAD = 0.4
 """rad beyond the model's joint range; from there the joint's name is doubted."""
 
 
-def sample_rows(log: Log) -> NDArray[np.intp]:
+def sample_rows(log: Log) -> Indices:
     """Select at most `MAX_ROWS` rows, spread evenly over the log.
 
     Args:
@@ -45,7 +45,7 @@ def sample_rows(log: Log) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, len(log.t) - 1, min(MAX_ROWS, len(log.t))).astype(np.intp))
 
 
-def slope_at_rows(log: Log, values: Array, row: NDArray[np.intp]) -> Array:
+def slope_at_rows(log: Log, values: Floats, row: Indices) -> Floats:
     """Compute central differences over `SLOPE_HALF_WIDTH_S` to either side.
 
     Args:

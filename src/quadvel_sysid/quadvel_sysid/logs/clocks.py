@@ -17,8 +17,9 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
+
+from quadvel_description.arrays import Array, Indices
 
 from .findings import Finding
 from .log import Log
@@ -29,8 +30,6 @@ from .response import (
     TIME_ROUNDING_S,
     motion_regressors,
 )
-
-Numbers = NDArray[np.float64]
 
 LAG_STEP_S = 0.002
 """s between two lags, at least one row of the log."""
@@ -67,13 +66,13 @@ class _JointSignals:
         sent: (N,) 1 after the first command, else 0.
     """
 
-    torque: Numbers
-    fixed: Numbers
-    moving: Numbers
-    use: Numbers
-    sent: Numbers
+    torque: Array
+    fixed: Array
+    moving: Array
+    use: Array
+    sent: Array
 
-    def error_share(self, most: int) -> Numbers:
+    def error_share(self, most: int) -> Array:
         """Share of the torque's variance that the regression leaves at each lag.
 
         Args:
@@ -93,7 +92,7 @@ class _JointSignals:
         causal = _causal(weights[:, command], weights[:, speed])
         return np.asarray(np.where(causal, np.minimum(plain, fed), plain) / (variance + 1e-12))
 
-    def _products(self, most: int) -> Numbers:
+    def _products(self, most: int) -> Array:
         """Products (L, P, P) of `fixed`, `moving` and `torque`, summed over overlapping rows."""
         # With weights w and v, each product is a cross-correlation over the overlapping rows,
         #   sum_t w(t) a(t) b(t) v(t - l) c(t - l) d(t - l),
@@ -114,7 +113,7 @@ class _JointSignals:
         found[:, a, b] = found[:, b, a] = np.concatenate([sums[:, -most:], sums[:, : most + 1]], axis=1).T
         return found
 
-    def squared_errors(self, late: int) -> Numbers:
+    def squared_errors(self, late: int) -> Array:
         """Squared error of the regression at one lag, over the torque's variance.
 
         Args:
@@ -142,7 +141,7 @@ def _causal(of_command: Any, of_speed: Any) -> Any:
     return (of_command * of_speed >= 0.0) & (np.abs(of_speed) <= MAX_SPEED_LEAD_S * np.abs(of_command))
 
 
-def _regress(products: Numbers, columns: NDArray[np.intp]) -> tuple[Numbers, Numbers]:
+def _regress(products: Array, columns: Indices) -> tuple[Array, Array]:
     """Regress the last column on `columns`: residual sums of squares (L,), weights (L, P - 1)."""
     # Normal equations X^T X w = X^T y at every lag, scaled to a unit diagonal; then
     # the residual is y^T y - w^T X^T y.
@@ -170,17 +169,17 @@ class LagProfile:
     joints: tuple[_JointSignals, ...]
 
     @cached_property
-    def lags(self) -> Numbers:
+    def lags(self) -> Array:
         """Lags (L,) from a command to its torque, s."""
         return np.asarray(self.step * np.arange(-self.max_steps, self.max_steps + 1), dtype=np.float64)
 
     @cached_property
-    def error_share(self) -> Numbers:
+    def error_share(self) -> Array:
         """Share (L, J) of each joint's torque variance that is left."""
         return np.stack([one.error_share(self.max_steps) for one in self.joints], axis=1)
 
     @cached_property
-    def mean_error_share(self) -> Numbers:
+    def mean_error_share(self) -> Array:
         """Geometric mean (L,) of `error_share` over the joints."""
         return np.asarray(np.exp(np.mean(np.log(self.error_share + 1e-6), axis=1)), dtype=np.float64)
 
@@ -225,7 +224,7 @@ def lag_profile(log: Log) -> LagProfile | None:
 
 
 def _joint_signals(
-    log: Log, j: int, row: NDArray[np.intp], command: NDArray[np.intp], sent: Numbers, step: float
+    log: Log, j: int, row: Indices, command: Indices, sent: Array, step: float
 ) -> _JointSignals:
     """Signals of joint `j` at evenly spaced instants, means removed."""
     q, dq = (np.asarray(x[row, j], dtype=float) for x in (log.q, log.dq))
@@ -243,7 +242,7 @@ def _joint_signals(
     )
 
 
-def _slope(x: Numbers, reach: int, step: float) -> Numbers:
+def _slope(x: Array, reach: int, step: float) -> Array:
     """Central difference of `x` (N,) over `reach` rows to either side."""
     first, last = np.maximum(np.arange(len(x)) - reach, 0), np.minimum(np.arange(len(x)) + reach, len(x) - 1)
     return np.asarray((x[last] - x[first]) / ((last - first) * step))

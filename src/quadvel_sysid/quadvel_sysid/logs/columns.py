@@ -24,11 +24,12 @@ from typing import Any
 import attrs
 import numpy as np
 
+from quadvel_description.arrays import Floats
 from quadvel_description.bounded_yaml import read_yaml
 
 from . import files
 from .findings import format_names
-from .log import Array, LogError
+from .log import LogError
 from .names import ALL_JOINTS, FIELDS, JOINT_NAMES_FIELD, resolve_columns
 from .raw import RawArrays
 from .units import si_factor
@@ -151,7 +152,7 @@ class ColumnMap:
         return cls({name: Source.parse(one, f"{path}: {name}") for name, one in given.items()}, tuple(joints))
 
 
-def read_fields(path: Path, names: ColumnMap) -> tuple[dict[str, Array], list[str] | None, list[str]]:
+def read_fields(path: Path, names: ColumnMap) -> tuple[dict[str, Floats], list[str] | None, list[str]]:
     """Read the fields of a log from its file or files.
 
     Args:
@@ -162,7 +163,7 @@ def read_fields(path: Path, names: ColumnMap) -> tuple[dict[str, Array], list[st
         Arrays by field in SI units; names of the joints, or None if not found; remarks about what
         was assumed.
     """
-    fields: dict[str, Array] = {}
+    fields: dict[str, Floats] = {}
     remarks: list[str] = []
     joints: list[str] | None = list(names.joints) or None
     places = dict.fromkeys([path, *(source.file_of(path) for source in names.sources.values())])
@@ -209,7 +210,7 @@ def _add_unmapped(
     path: Path,
     raw: RawArrays,
     names: ColumnMap,
-    fields: dict[str, Array],
+    fields: dict[str, Floats],
     joints: list[str] | None,
     remarks: list[str],
 ) -> list[str] | None:
@@ -277,7 +278,7 @@ def _stack_columns(
     raw: RawArrays,
     scale: float | list[float] | None,
     of_joints: bool = False,
-) -> Array:
+) -> Floats:
     """Stack columns to one array in SI units, without trailing rows that hold no number."""
     parts = [raw.arrays[name] * _unit_factor(path, name, raw.units.get(name), scale) for name in columns]
     values = np.stack(parts, 1) if len(columns) > 1 or of_joints else parts[0]

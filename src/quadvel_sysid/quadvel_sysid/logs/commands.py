@@ -8,6 +8,8 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from quadvel_description.arrays import Array
+
 from .channels import MOVING_SPAN_RAD, joints_where, sample_rows
 from .findings import Finding, format_names
 from .log import Log
@@ -63,7 +65,7 @@ def constant_command(log: Log) -> Iterator[Finding | Log]:
         yield attrs.evolve(log, valid=log.valid & ~hit)
 
 
-def _span(angles: NDArray[np.floating]) -> NDArray[np.float64]:
+def _span(angles: NDArray[np.floating]) -> Array:
     """Range (J,) of each column between two percentiles, rad."""
     return np.asarray(np.ptp(np.percentile(angles, SPAN_PERCENTILES, axis=0), axis=0))
 
@@ -84,6 +86,6 @@ def _holds(log: Log, j: int) -> bool:
     return bool(pull < 0.0 and answered > MIN_ANSWERED_SHARE and left < MAX_HOLDING_ERROR)
 
 
-def _residual(signals: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _residual(signals: Array, x: Array) -> Array:
     """Residual of `x` after a least-squares fit on `signals`."""
     return np.asarray(x - signals @ np.linalg.lstsq(signals, x, rcond=1e-9)[0])

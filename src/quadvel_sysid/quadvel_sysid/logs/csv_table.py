@@ -21,8 +21,10 @@ from typing import IO, Any
 import attrs
 import numpy as np
 
+from quadvel_description.arrays import Floats
+
 from . import units
-from .log import Array, LogError
+from .log import LogError
 from .names import TIME_FIELDS
 from .raw import MAX_LINE_CHARS, MAX_TEXT_CHARS, MAX_VALUES, ColumnChooser, RawArrays, field_dtype, open_bytes
 
@@ -226,7 +228,7 @@ def _has_decimal_comma(form: _Dialect, lines: Sequence[Line]) -> bool:
 
 def _blocks(
     path: Path, lines: Iterator[Line], form: _Dialect, chosen: Mapping[str, str], remarks: list[str]
-) -> Iterator[list[Array]]:
+) -> Iterator[list[Floats]]:
     """Yield the chosen columns, block by block of lines."""
     # Expected number of values, if a cell has eight characters.
     values = max(1, path.stat().st_size // max(1, 2 * len(form.columns))) * len(chosen) // 4
@@ -256,7 +258,7 @@ def _block(lines: Iterator[Line], most: int = MAX_BLOCK_LINES) -> Iterator[Line]
             return
 
 
-def _parse_numeric(form: _Dialect, block: Sequence[Line], chosen: Mapping[str, str]) -> list[Array] | None:
+def _parse_numeric(form: _Dialect, block: Sequence[Line], chosen: Mapping[str, str]) -> list[Floats] | None:
     """Parse lines whose chosen cells hold plain numbers or nothing; None if one does not."""
     separator = form.separator
     lines = [line.strip() if separator is None else line.strip("\r\n ") for _, line in block]
@@ -289,7 +291,7 @@ def _parse_cells(
     lines: Iterator[Line],
     chosen: Mapping[str, str],
     remarks: list[str],
-) -> list[Array]:
+) -> list[Floats]:
     """Parse cells of every kind that `_Dialect.number` reads; a quoted one may span lines."""
     rows = _split_rows(path, form, block, lines, remarks)
     found = []

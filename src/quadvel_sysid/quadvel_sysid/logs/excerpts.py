@@ -10,10 +10,11 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from .log import Array, Log, LogError
+from quadvel_description.arrays import Floats
+
+from .log import Log, LogError
 
 PIECE_S = 0.75
 """s; many short excerpts of a long log show more of its motion than few long ones."""
@@ -128,14 +129,14 @@ def _distinct_commands(log: Log) -> Log:
     return attrs.evolve(log, **{name: values[rows] for name, values in fields.items()})
 
 
-def _jitter(time: NDArray[np.floating]) -> float:
+def _jitter(time: Floats) -> float:
     """Range of the spacing (10th to 90th percentile) over its median."""
     steps = np.diff(time)
     low, usual, high = np.percentile(steps, [10, 50, 90])
     return float((high - low) / usual)
 
 
-def _even_times(time: NDArray[np.floating], window: int) -> Array:
+def _even_times(time: Floats, window: int) -> Floats:
     """Times of an even clock plus its drift, a median-filtered deviation from a uniform clock."""
     reach = min(_PERIOD_ROWS, len(time) // 3)
     if reach < 20 or _jitter(time) <= MIN_JITTER:
@@ -144,7 +145,7 @@ def _even_times(time: NDArray[np.floating], window: int) -> Array:
     # drift from a median filter of t_n - T n.
     period = float(np.median(time[reach:] - time[:-reach])) / reach
     clock = period * np.arange(len(time))
-    even: Array = clock + median_filter(np.asarray(time - clock, dtype=float), window, mode="nearest")
+    even: Floats = clock + median_filter(np.asarray(time - clock, dtype=float), window, mode="nearest")
     least = 1e-4 * period  # keeps the times strictly increasing
-    rising: Array = np.maximum.accumulate(even) + least * np.arange(len(even)) / len(even)
+    rising: Floats = np.maximum.accumulate(even) + least * np.arange(len(even)) / len(even)
     return rising

@@ -9,14 +9,11 @@ The checks of a valid log against the robot are in `checks.py`. The readers are 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.floating[Any]]
-Bools = NDArray[np.bool_]
+from quadvel_description.arrays import Bools, Floats, Indices
 
 TIME_TOLERANCE_S = 1e-9
 """s; a command sent at most this long after an instant is in force at it (round-off of summed
@@ -83,19 +80,19 @@ class Log:
 
     name: str
     joints: tuple[str, ...]
-    t: Array
-    q: Array
-    dq: Array
-    t_cmd: Array
-    q_des: Array
+    t: Floats
+    q: Floats
+    dq: Floats
+    t_cmd: Floats
+    q_des: Floats
     valid: Bools
-    tau: Array | None = None
-    temperature: Array | None = None
-    voltage: Array | None = None
-    dq_des: Array | None = None
-    tau_ff: Array | None = None
-    kp: Array | None = None
-    kd: Array | None = None
+    tau: Floats | None = None
+    temperature: Floats | None = None
+    voltage: Floats | None = None
+    dq_des: Floats | None = None
+    tau_ff: Floats | None = None
+    kp: Floats | None = None
+    kd: Floats | None = None
     recording_start: float | None = None
     remarks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -131,7 +128,7 @@ class Log:
         after: Bools = np.diff(self.t, prepend=self.t[0]) > GAP_FACTOR * self.period
         return after
 
-    def command_rows(self, at: Array) -> NDArray[np.intp]:
+    def command_rows(self, at: Floats) -> Indices:
         """Return the command rows in force at given times.
 
         Args:
@@ -219,7 +216,7 @@ class Log:
         }
         return attrs.evolve(self, joints=names, **selected)
 
-    def _check_time(self, field: str, time: Array) -> None:
+    def _check_time(self, field: str, time: Floats) -> None:
         if time.ndim != 1 or len(time) < MIN_ROWS:
             raise LogError(f"{self.name}: {field}: found shape {time.shape}, expected ({MIN_ROWS} or more,)")
         self._check_finite(field, time)
@@ -233,14 +230,14 @@ class Log:
                 "expected rows in the order of time"
             )
 
-    def _check_values(self, field: str, values: Array | Bools | None, shape: tuple[int, ...]) -> None:
+    def _check_values(self, field: str, values: Floats | Bools | None, shape: tuple[int, ...]) -> None:
         if values is None:
             return
         if values.shape != shape:
             raise LogError(f"{self.name}: {field}: found shape {values.shape}, expected {shape}")
         self._check_finite(field, values)
 
-    def _check_finite(self, field: str, values: Array | Bools) -> None:
+    def _check_finite(self, field: str, values: Floats | Bools) -> None:
         finite = np.isfinite(values)
         if finite.all():
             return

@@ -14,8 +14,10 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from quadvel_description.arrays import Bools, Floats, Indices
+
 from .findings import Finding, format_names
-from .log import Array, Bools, Log
+from .log import Log
 from .response import motion_regressors
 
 BIN_S = 0.02
@@ -107,7 +109,7 @@ def masked_rows(log: Log) -> Iterator[Finding]:
         yield Finding("note", "valid", (), f"valid: false {_span_text(out, log.t)}; left out")
 
 
-def _span_text(rows: Any, t: Array) -> str:
+def _span_text(rows: Any, t: Floats) -> str:
     """Describe the time spans of a mask, with their total duration."""
     spans = true_runs(rows, t)
     return f"{format_spans(spans, t)} ({sum(last - first for first, last in spans):.2f} s)"
@@ -139,7 +141,7 @@ def out_of_control(log: Log) -> Bools:
     return _drifting_rows(log) if log.tau is None else _low_gain_rows(log)
 
 
-def true_runs(rows: NDArray[Any], t: Array, least: float = 0.0) -> list[tuple[float, float]]:
+def true_runs(rows: NDArray[Any], t: Floats, least: float = 0.0) -> list[tuple[float, float]]:
     """Find the runs of true rows.
 
     Args:
@@ -205,11 +207,11 @@ def _differential_gain(log: Log, rows: Bools, lag: float) -> float:
         x = (x - (x @ level)[:, None]) * use
         squares += x @ x.T
         products += x @ (tau - tau @ level)
-    found: Array = np.linalg.lstsq(squares, products, rcond=1e-3)[0]
+    found: Floats = np.linalg.lstsq(squares, products, rcond=1e-3)[0]
     return float(found[0])
 
 
-def _relative_error(log: Log, lost: Bools) -> Array | None:
+def _relative_error(log: Log, lost: Bools) -> Floats | None:
     """Squared error (N,) of a PD law of each joint, over its mean outside `lost`.
 
     None if the rows outside are too few. If the law holds within `lost` as well, the drives were
@@ -227,7 +229,7 @@ def _relative_error(log: Log, lost: Bools) -> Array | None:
     return np.asarray(np.mean([one / (one[fitted].mean() + 1e-12) for one in left], axis=0))
 
 
-def _squared_error(log: Log, j: int, fitted: NDArray[np.intp], lag: float) -> NDArray[np.float64]:
+def _squared_error(log: Log, j: int, fitted: Indices, lag: float) -> Floats:
     """Squared error (N,) of one joint's PD law at a lag; 0 in invalid rows."""
     assert log.tau is not None
     row = np.maximum(np.searchsorted(log.t, log.t - lag, side="right") - 1, 0)
@@ -242,9 +244,7 @@ def _squared_error(log: Log, j: int, fitted: NDArray[np.intp], lag: float) -> ND
     return np.asarray(log.valid[:, j] * (tau - law @ weights) ** 2)
 
 
-def _joint_signals(
-    log: Log, rows: NDArray[np.intp], lag: float
-) -> Iterator[tuple[Array, Array, Array, Array]]:
+def _joint_signals(log: Log, rows: Indices, lag: float) -> Iterator[tuple[Floats, Floats, Floats, Floats]]:
     """Yield for each joint: validity, kp times error, -dq, torque; error and dq `lag` s earlier."""
     row = np.maximum(np.searchsorted(log.t, log.t[rows] - lag, side="right") - 1, 0)
     command = log.command_rows(log.t[row])
@@ -256,7 +256,7 @@ def _joint_signals(
         yield use, e, -use * log.dq[row, j], use * log.tau[rows, j]
 
 
-def _binned_sums(log: Log, bins: NDArray[np.intp], rows: NDArray[np.intp], lag: float) -> NDArray[np.float64]:
+def _binned_sums(log: Log, bins: Indices, rows: Indices, lag: float) -> Floats:
     """Sums over joints and rows of each bin: 1, e^2, e d, d^2, e tau, d tau, tau^2 with d = -dq."""
     total = np.zeros((7, bins[-1] + 1))
     for use, e, d, tau in _joint_signals(log, rows, lag):
@@ -265,7 +265,7 @@ def _binned_sums(log: Log, bins: NDArray[np.intp], rows: NDArray[np.intp], lag: 
     return total
 
 
-def _explained_share(sums: NDArray[np.float64]) -> float:
+def _explained_share(sums: Floats) -> float:
     """Median over the bins of the squared correlation of position error and torque."""
     _, ee, _, _, et, _, tt = sums
     there = (ee > 0.0) & (tt > 0.0)
@@ -287,7 +287,7 @@ def _drifting_rows(log: Log) -> Bools:
     return _with_margin(np.isin(changes[row], drifted) & (since > 2.0 * OUTAGE_MARGIN_S), log.t)
 
 
-def _with_margin(rows: Bools, t: Array) -> Bools:
+def _with_margin(rows: Bools, t: Floats) -> Bools:
     """Keep runs of at least `MIN_OUTAGE_S` and extend them by `OUTAGE_MARGIN_S` on both sides."""
     wide = np.zeros(len(t), bool)
     for first, last in true_runs(rows, t, MIN_OUTAGE_S):
@@ -295,7 +295,7 @@ def _with_margin(rows: Bools, t: Array) -> Bools:
     return wide
 
 
-def format_spans(spans: list[tuple[float, float]], t: Array, most: int = 4) -> str:
+def format_spans(spans: list[tuple[float, float]], t: Floats, most: int = 4) -> str:
     """Describe time spans in words.
 
     Args:

@@ -12,10 +12,11 @@ from typing import Any
 import attrs
 import numpy as np
 
+from quadvel_description.arrays import Floats
 from quadvel_recordings.joint_log import Series, common_joints, read_joint_log, require_commands
 from quadvel_recordings.reading import RecordingError
 
-from .log import Array, Log, LogError, joint_name
+from .log import Log, LogError, joint_name
 from .raw import check_size, storage_dtype
 from .tables import drop_repeated_times
 
@@ -97,7 +98,7 @@ def _joints(path: Path, state: Series, command: Series, remarks: list[str]) -> l
 
 def _select_joints(
     path: Path, field: str, series: Series, joints: list[str], remarks: list[str]
-) -> tuple[Array, dict[str, Any]]:
+) -> tuple[Floats, dict[str, Any]]:
     """Times and values of these joints, without rows that repeat a time."""
     columns = [series.joints.index(name) for name in joints]
     check_size(path, {name: values.shape for name, values in series.values.items()})
@@ -106,6 +107,6 @@ def _select_joints(
     return drop_repeated_times(field, series.time, values, remarks)
 
 
-def _none_if_zero(values: Array | None) -> Array | None:
+def _none_if_zero(values: Floats | None) -> Floats | None:
     """None if all values are 0."""
     return values if values is not None and values.any() else None

@@ -12,12 +12,13 @@ from collections.abc import Iterator, Sequence
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+
+from quadvel_description.arrays import Bools, Floats, Indices
 
 from .channels import DEGREE_RAD, MOVING_SPAN_RAD, TURN_RAD, joints_where
 from .findings import Finding, format_names
-from .log import Array, Bools, Log
+from .log import Log
 
 MAX_ROWS = 4000
 """Rows of a log that are used, spread over its length."""
@@ -71,17 +72,17 @@ class Response:
     """
 
     log: Log
-    rows: NDArray[np.intp]
-    lags: Array
-    error_share: Array
-    command_correlation: Array
-    angle_correlation: Array
-    gain: Array
-    command_gain: Array
-    answered_share: Array
+    rows: Indices
+    lags: Floats
+    error_share: Floats
+    command_correlation: Floats
+    angle_correlation: Floats
+    gain: Floats
+    command_gain: Floats
+    answered_share: Floats
 
     @property
-    def min_error_share(self) -> Array:
+    def min_error_share(self) -> Floats:
         """Error share (J,) at each joint's best lag."""
         return np.asarray(self.error_share.min(axis=0))
 
@@ -111,8 +112,8 @@ def measure_response(log: Log) -> Response | None:
 
 
 def _of_joint(
-    log: Log, row: NDArray[np.intp], at: Sequence[NDArray[np.intp]], j: int
-) -> tuple[Array, tuple[float, float, float, float, float]]:
+    log: Log, row: Indices, at: Sequence[Indices], j: int
+) -> tuple[Floats, tuple[float, float, float, float, float]]:
     """Error share (L,) of joint `j`, and its five scalars of `Response`.
 
     Args:
@@ -150,7 +151,7 @@ def _of_joint(
     return misses.mean(axis=0), (float(r[k]), angle, gain, command_gain, answer if gain > 0.0 else 0.0)
 
 
-def motion_regressors(dq: Array) -> Array:
+def motion_regressors(dq: Floats) -> Floats:
     """Return the regressors of speed, Coulomb friction and offset.
 
     Args:
@@ -162,16 +163,16 @@ def motion_regressors(dq: Array) -> Array:
     return np.stack([dq, np.tanh(dq / FRICTION_SPEED_RAD_S), np.ones(len(dq))], 1)
 
 
-def _project_out(regressors: Array, x: Array) -> Array:
+def _project_out(regressors: Floats, x: Floats) -> Floats:
     """Residual of `x` (R,) or (R, L) after a least-squares fit on `regressors` (R, K)."""
     basis = np.linalg.qr(regressors)[0]
-    left: Array = x - basis @ (basis.T @ x)
+    left: Floats = x - basis @ (basis.T @ x)
     return left
 
 
-def _residual(y: Array, x: Array) -> Array:
+def _residual(y: Floats, x: Floats) -> Floats:
     """Residual of `y` (R,) after a least-squares fit on one regressor `x` (R,)."""
-    left: Array = y - x * (x @ y) / (x @ x + 1e-12)
+    left: Floats = y - x * (x @ y) / (x @ x + 1e-12)
     return left
 
 
@@ -253,7 +254,7 @@ def _error_share(found: Response, j: int, k: int, m: int) -> float:
     return min(shares)
 
 
-def _best_order(log: Log, own: Array, left: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _best_order(log: Log, own: Floats, left: Floats) -> tuple[Indices, Indices]:
     """The best assignment of columns (Hungarian method), and the joints that gain clearly by it.
 
     Args:
@@ -271,9 +272,7 @@ def _best_order(log: Log, own: Array, left: Array) -> tuple[NDArray[np.intp], ND
     ), order
 
 
-def _order_finding(
-    log: Log, field: str, what: str, moved: NDArray[np.intp], order: NDArray[np.intp]
-) -> Finding:
+def _order_finding(log: Log, field: str, what: str, moved: Indices, order: Indices) -> Finding:
     """The refusal of a wrong order of joints."""
     pairs = format_names([f"{log.joints[j]} follows {log.joints[order[j]]}" for j in moved])
     text = f"{field}: a joint's {what} ({pairs}): the columns are in different orders"
@@ -351,7 +350,7 @@ def gain_units(log: Log, found: Response) -> Iterator[Finding | Log]:
     yield attrs.evolve(log, kp=None, kd=None)
 
 
-def _is_far_off(ratio: Array) -> Bools:
+def _is_far_off(ratio: Floats) -> Bools:
     """Whether a ratio, or its inverse, exceeds `UNIT_GAIN_FACTOR`."""
     return np.abs(np.log(np.maximum(ratio, 1e-12))) > np.log(UNIT_GAIN_FACTOR)
 
@@ -403,7 +402,7 @@ def command_tracking(log: Log) -> Iterator[Finding]:
         yield _order_finding(log, "q_des", "q follows another joint's command", moved, order)
 
 
-def _normalised(values: Array) -> NDArray[np.float64]:
+def _normalised(values: Floats) -> Floats:
     """Columns with their mean removed and scaled to length 1; a constant column becomes 0."""
     centred = values.astype(float) - values.astype(float).mean(axis=0)
     length = np.sqrt(np.sum(centred**2, axis=0))

@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
+
+from quadvel_description.arrays import Array
 
 from .channels import sample_rows
 from .findings import Finding
@@ -65,7 +66,7 @@ def collinear(log: Log) -> Iterator[Finding]:
             yield Finding("note" if share > 0.5 * MIN_SEPARATION else "warning", "q_des", (), text)
 
 
-def _traces(log: Log) -> list[dict[str, NDArray[np.float64]]] | None:
+def _traces(log: Log) -> list[dict[str, Array]] | None:
     """Derivative (n,) of each moving joint's torque by each parameter; None if no joint moves."""
     row = sample_rows(log)
     row = row[log.valid[row].any(axis=1)]
@@ -94,12 +95,12 @@ def _traces(log: Log) -> list[dict[str, NDArray[np.float64]]] | None:
     return [{name: values[:, j] for name, values in traces.items()} for j in moving] or None
 
 
-def _gain_traces(traces: dict[str, NDArray[np.float64]], *but: str) -> NDArray[np.float64]:
+def _gain_traces(traces: dict[str, Array], *but: str) -> Array:
     """Traces (n, K) of the gains other than `but`; gains are always fitted as well."""
     return np.stack([traces[name] for name in ("kp", "kd") if name not in but], axis=1)
 
 
-def _sine_between(a: NDArray[np.float64], b: NDArray[np.float64], others: NDArray[np.float64]) -> float:
+def _sine_between(a: Array, b: Array, others: Array) -> float:
     """Sine of the angle between two traces after projecting out the others.
 
     1 if one of them is 0; 0 if the others explain one of them entirely.

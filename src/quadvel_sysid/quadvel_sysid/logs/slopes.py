@@ -17,7 +17,9 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from .log import GAP_FACTOR, Array
+from quadvel_description.arrays import Floats
+
+from .log import GAP_FACTOR
 
 WINDOW_ROWS = (5, 7, 9, 13, 17, 21, 25, 33, 45, 65, 91)
 """Candidate widths of the filter, rows."""
@@ -37,12 +39,12 @@ class SmoothedMotion:
         window_s: Duration of the filter's window, s.
     """
 
-    q: Array
-    dq: Array
+    q: Floats
+    dq: Floats
     window_s: float
 
 
-def smooth_motion(t: Array, q: Array, tau: Array | None = None) -> SmoothedMotion:
+def smooth_motion(t: Floats, q: Floats, tau: Floats | None = None) -> SmoothedMotion:
     """Compute joint speeds from joint angles.
 
     Both q and t are filtered over the row number, and dq = (dq/dn) / (dt/dn), so times may be
@@ -90,7 +92,7 @@ def smooth_motion(t: Array, q: Array, tau: Array | None = None) -> SmoothedMotio
     return SmoothedMotion(level, slope, max(width - 1, 2) * usual)
 
 
-def _leave_one_out_error(q: Array, pushed: Array, width: int) -> tuple[float, int, Array]:
+def _leave_one_out_error(q: Floats, pushed: Floats, width: int) -> tuple[float, int, Floats]:
     """Mean squared error of predicting a left-out row, the width, and the fitted mobility (J, J).
 
     A linear filter with weight h of a row on itself has the left-out residual e / (1 - h).
@@ -102,11 +104,11 @@ def _leave_one_out_error(q: Array, pushed: Array, width: int) -> tuple[float, in
     miss, driven = (
         (x - savgol_filter(x, width, POLYNOMIAL_ORDER, axis=0))[inner] / (1.0 - own) for x in (q, pushed)
     )
-    mobility: Array = np.linalg.lstsq(driven, miss, rcond=1e-8)[0]
+    mobility: Floats = np.linalg.lstsq(driven, miss, rcond=1e-8)[0]
     return float(np.mean((miss - driven @ mobility) ** 2)), width, mobility
 
 
-def encoder_step(q: Array) -> Array:
+def encoder_step(q: Floats) -> Floats:
     """Find the step in which each joint's encoder counts.
 
     Args:

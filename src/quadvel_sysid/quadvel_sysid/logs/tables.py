@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from quadvel_description.arrays import Bools, Floats
 from quadvel_description.robot import JOINT_NAMES
 
 from .columns import ColumnMap, read_fields
-from .log import Array, Bools, Log, LogError, joint_name
+from .log import Log, LogError, joint_name
 from .raw import check_size
 
 STATE_FIELDS = ("q", "dq", "tau", "temperature")
@@ -45,8 +46,8 @@ def read_table(path: Path, names: ColumnMap) -> Log:
 
 
 def drop_repeated_times(
-    field: str, time: Array, values: Mapping[str, Any], remarks: list[str]
-) -> tuple[Array, dict[str, Any]]:
+    field: str, time: Floats, values: Mapping[str, Any], remarks: list[str]
+) -> tuple[Floats, dict[str, Any]]:
     """Drop rows whose time equals that of the row before.
 
     Args:
@@ -141,7 +142,7 @@ def _valid(path: Path, values: Any, rows: int, joints: int) -> Bools:
     return _per_joint(flags, rows, joints)
 
 
-def _commands(path: Path, fields: dict[str, Any], t: Array, joints: int) -> tuple[Array, dict[str, Any]]:
+def _commands(path: Path, fields: dict[str, Any], t: Floats, joints: int) -> tuple[Floats, dict[str, Any]]:
     """Times of the commands, and all fields on them."""
     own = "q_des_cmd" in fields
     if own and "t_cmd" not in fields:
@@ -162,7 +163,7 @@ def _commands(path: Path, fields: dict[str, Any], t: Array, joints: int) -> tupl
     return t_cmd, command
 
 
-def _on_commands(path: Path, name: str, values: Array, t: Array, t_cmd: Array, joints: int) -> Array:
+def _on_commands(path: Path, name: str, values: Floats, t: Floats, t_cmd: Floats, joints: int) -> Floats:
     """Bring one value, one for each joint, or rows on either time base to shape (M, J)."""
     if values.size == 1 or values.shape == (joints,):
         return np.broadcast_to(values.reshape(-1), (len(t_cmd), joints))

@@ -6,14 +6,13 @@ from collections.abc import Iterator
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
+
+from quadvel_description.arrays import Bools, Floats, Indices
 
 from .channels import TURN_RAD, joints_where, sample_rows
 from .findings import Finding, format_names
-from .log import Array, Bools, Log
+from .log import Log
 from .response import EXPLAINED_ERROR_SHARE, TIME_ROUNDING_S, motion_regressors
-
-Numbers = NDArray[np.float64]
 
 LAGS_S = (0.0, 0.005, 0.01, 0.02, 0.04)
 """s; lags from a command to its torque that are tried."""
@@ -68,7 +67,7 @@ def spikes(log: Log) -> Iterator[Finding | Log]:
         yield attrs.evolve(log, tau=level, valid=log.valid & ~hit)
 
 
-def _without_spikes(log: Log, j: int) -> tuple[Numbers, Bools]:
+def _without_spikes(log: Log, j: int) -> tuple[Floats, Bools]:
     """Replace the spikes of a joint by the median around them; return torque and mask, (N,)."""
     assert log.tau is not None
     tau = np.asarray(log.tau[:, j], dtype=float)
@@ -91,7 +90,7 @@ def _without_spikes(log: Log, j: int) -> tuple[Numbers, Bools]:
     return (level, hit) if hit.sum() >= MIN_SPIKES else (tau, np.zeros(len(tau), bool))
 
 
-def _pd_regressors(log: Log, row: NDArray[np.intp], j: int, lag: float) -> Numbers:
+def _pd_regressors(log: Log, row: Indices, j: int, lag: float) -> Floats:
     """Regressors of a PD law, (R, 5 or more): error, angle, speed, friction, 1, feed-forward terms."""
     sent = log.command_rows(log.t[row] - lag + TIME_ROUNDING_S)
     q, dq = (np.asarray(x[row, j], dtype=float) for x in (log.q, log.dq))
@@ -101,7 +100,7 @@ def _pd_regressors(log: Log, row: NDArray[np.intp], j: int, lag: float) -> Numbe
     )
 
 
-def _local_median(x: Numbers) -> tuple[Numbers, Numbers]:
+def _local_median(x: Floats) -> tuple[Floats, Floats]:
     """Median (N,) of the four rows around each row, and how far the row exceeds all but one.
 
     The excess is 0 if it is less than half the range of these four: the peak of a fast motion is
@@ -115,12 +114,12 @@ def _local_median(x: Numbers) -> tuple[Numbers, Numbers]:
     return np.asarray(np.median(sides, axis=0)), alone
 
 
-def _robust_std(deviation: Numbers) -> float:
+def _robust_std(deviation: Floats) -> float:
     """Standard deviation of the normal distribution that has the bulk of the deviations."""
     return float(np.quantile(np.abs(deviation), BULK_QUANTILE)) / 1.28 + 1e-9
 
 
-def _fitted_torque(law: Numbers, tau: Numbers, use: Bools) -> Numbers:
+def _fitted_torque(law: Floats, tau: Floats, use: Bools) -> Floats:
     """Torque (N,) of the law fitted to the rows in `use`, with outliers removed round by round."""
     rows = np.flatnonzero(use)
     rows = rows[:: max(1, len(rows) // MAX_FIT_ROWS)]
@@ -162,7 +161,7 @@ def unsigned_torque(log: Log) -> Iterator[Finding]:
         yield Finding("refusal", "tau", joints, text)
 
 
-def lacks_sign(values: Array, twin: Array) -> Bools:
+def lacks_sign(values: Floats, twin: Floats) -> Bools:
     """Find joints whose values keep one sign although a related signal changes its sign.
 
     Args:
@@ -180,7 +179,7 @@ def lacks_sign(values: Array, twin: Array) -> Bools:
     return np.asarray(one_way & touches & both)
 
 
-def is_magnitude(values: Numbers, signals: Numbers) -> bool:
+def is_magnitude(values: Floats, signals: Floats) -> bool:
     """Decide whether values are the magnitude of a linear combination of signals.
 
     If y = |x w|, then y^2 = sum_ab W_ab x_a x_b with W = w w^T. A linear fit gives W; the signs
@@ -210,6 +209,6 @@ def is_magnitude(values: Numbers, signals: Numbers) -> bool:
     return least < MAGNITUDE_ERROR_RATIO * signed
 
 
-def _squared_error(signals: Numbers, values: Numbers) -> float:
+def _squared_error(signals: Floats, values: Floats) -> float:
     """Sum of squared residuals of the least-squares fit of `values` on `signals`."""
     return float(np.sum((values - signals @ np.linalg.lstsq(signals, values, rcond=1e-9)[0]) ** 2))

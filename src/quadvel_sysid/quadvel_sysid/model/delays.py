@@ -11,7 +11,8 @@ from functools import cache
 import attrs
 import numpy as np
 
-from ..data.signals import Array, Bools
+from quadvel_description.arrays import Array, Bools
+
 from .fit import fit, squared_error
 from .torque_model import MAX_DELAYS_S, Model
 

@@ -15,7 +15,8 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from ..data.signals import Array, Bools
+from quadvel_description.arrays import Array, Bools
+
 from ..parallel import parallel_map
 from .torque_model import MAX_DELAYS_S, Model, Unknowns, jacobian, pack, with_slots
 

@@ -18,14 +18,12 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
 from quadvel_actuator.effects import DRIVE, AddedLaw, EffectLaw, ErrorLaw, MemoryLaw, Stage
 from quadvel_actuator.effects.base import distinct_indices
+from quadvel_description.arrays import Array, Bools, Indices
 
-from ..data.signals import INSTANTS_PER_ROW, Array, Bools, Samples, Signals
-
-Groups = NDArray[np.intp]
+from ..data.signals import INSTANTS_PER_ROW, Samples, Signals
 
 MAX_DELAYS_S = np.array([0.020, 0.006])
 """Upper bounds of the input delay and of the output delay, s."""
@@ -48,7 +46,7 @@ class AppliedEffect:
     law: EffectLaw
     active: Bools
     values: Array
-    groups: Groups
+    groups: Indices
 
     @property
     def reads_total_torque(self) -> bool:
@@ -128,9 +126,9 @@ class Model:
     samples: Samples
     window: float
     gains: Array
-    gain_groups: Groups
+    gain_groups: Indices
     delays: Array
-    delay_groups: Groups
+    delay_groups: Indices
     effects: tuple[AppliedEffect, ...] = ()
 
     @property
@@ -391,7 +389,7 @@ class Unknowns:
         step: Step of the finite differences of each slot, (A,).
     """
 
-    index: Groups
+    index: Indices
     low: Array
     high: Array
     step: Array
@@ -412,7 +410,7 @@ class Unknowns:
         Returns:
             The mapping, with one unknown for each slot and group of joints.
         """
-        rows: list[Groups] = []
+        rows: list[Indices] = []
         low: list[float] = []
         high: list[float] = []
         step: list[float] = []
@@ -469,8 +467,8 @@ DELAY_STEP_S = 0.0003
 
 def _parameter_slots(
     model: Model, delays: bool
-) -> Iterator[tuple[Groups, Bools, tuple[float, float], float]]:
-    """Groups, free joints, bounds and finite-difference step of each slot."""
+) -> Iterator[tuple[Indices, Bools, tuple[float, float], float]]:
+    """Indices, free joints, bounds and finite-difference step of each slot."""
     everywhere = np.ones(model.gains.shape[1], dtype=bool)
     has_gains = model.samples.commanded and not model.samples.undamped
     for _ in model.gains:

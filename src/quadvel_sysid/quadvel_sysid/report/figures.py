@@ -13,7 +13,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from .identification import Array, Shape, Trace
+from quadvel_description.arrays import Array
+
+from .identification import Shape, Trace
 
 MEASURED, PD, BEFORE, AFTER = "#7d8590", "#b58900", "#d9622b", "#1a8fc4"
 """Colours of the models, readable on white and on black."""

@@ -9,12 +9,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import attrs
-import numpy as np
-from numpy.typing import NDArray
 
 from quadvel_actuator.parameters import ActuatorParameters
-
-Array = NDArray[np.float64]
+from quadvel_description.arrays import Array
 
 
 @attrs.frozen(eq=False)

@@ -10,9 +10,9 @@ import numpy as np
 
 from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
 from quadvel_actuator.parameters import ActuatorParameters
+from quadvel_description.arrays import Array
 
 from ..data.preparation import reference_gains
-from ..data.signals import Array
 from ..data.split import DataSplit
 from ..export.export_parameters import (
     acting_joints,

@@ -10,8 +10,8 @@ import attrs
 import numpy as np
 
 from quadvel_actuator.effects import EffectLaw
+from quadvel_description.arrays import Bools
 
-from ..data.signals import Bools
 from ..model.fit import fit, fit_near_delays
 from ..model.torque_model import Model
 from ..parallel import parallel_map

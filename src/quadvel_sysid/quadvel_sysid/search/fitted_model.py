@@ -8,10 +8,11 @@ from functools import cached_property
 import attrs
 import numpy as np
 
-from ..data.signals import Array
+from quadvel_description.arrays import Array, Indices
+
 from ..data.split import DataSplit
 from ..model.fit import fit, fit_delay_profile
-from ..model.torque_model import AppliedEffect, Groups, Model
+from ..model.torque_model import AppliedEffect, Model
 from ..parallel import parallel_map
 from ..statistics.criterion import (
     PENALTY_PER_PARAMETER,
@@ -216,7 +217,7 @@ class ModelEvaluator:
         return fitted
 
 
-def joint_kinds(joints: Iterable[str]) -> Groups:
+def joint_kinds(joints: Iterable[str]) -> Indices:
     """Number the kinds of joints, whose names differ in the first part only.
 
     `FR_hip_joint` and `FL_hip_joint` are of one kind.
@@ -228,11 +229,11 @@ def joint_kinds(joints: Iterable[str]) -> Groups:
         Kind of each joint, (J,).
     """
     names = [name.partition("_")[2] or name for name in joints]
-    found: Groups = np.unique(names, return_inverse=True)[1]
+    found: Indices = np.unique(names, return_inverse=True)[1]
     return found
 
 
-def joint_groupings(joints: Sequence[str]) -> list[Groups]:
+def joint_groupings(joints: Sequence[str]) -> list[Indices]:
     """List the ways to group joints: by kind, and each joint alone.
 
     Args:

@@ -32,8 +32,9 @@ from quadvel_actuator.effects.terms import (
     read_signal,
 )
 from quadvel_actuator.running import ACCELERATION_WINDOW_S
+from quadvel_description.arrays import Array, Bools
 
-from ..data.signals import Array, Bools, Signals
+from ..data.signals import Signals
 from ..data.split import DataSplit
 from ..model.torque_model import AppliedEffect, Model
 from .lost_commands import lost_commands

@@ -13,11 +13,10 @@ from __future__ import annotations
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
 from quadvel_actuator.effects.commands import MAX_BACKLOG, CommandHold
+from quadvel_description.arrays import Array, Bools, Indices
 
-from ..data.signals import Array, Bools
 from ..data.split import DataSplit
 from ..model.fit import fit, squared_error
 from ..model.torque_model import AppliedEffect, Model
@@ -161,7 +160,7 @@ def _at_random(model: Model, odds: Array, usual: Array, parts: DataSplit) -> boo
     return predicted - observed > _MIN_UNPREDICTABLE_SHARE * (min(without) - observed) > 0.0
 
 
-def _expand_rows(odds: Array, rows: NDArray[np.intp]) -> Array:
+def _expand_rows(odds: Array, rows: Indices) -> Array:
     """Repeat the probabilities (N, J, M) of some `rows` (N,) for every row up to the last one."""
     at = np.searchsorted(rows, np.arange(rows[-1] + 1))
     return odds[at]
@@ -246,7 +245,7 @@ def _row_costs(model: Model, noise: Array, most: int) -> Array:
     return np.stack(cost, axis=-1)
 
 
-def _forward_backward(costs: Array, new: NDArray[np.intp], chances: LossProbabilities) -> tuple[Array, Array]:
+def _forward_backward(costs: Array, new: Indices, chances: LossProbabilities) -> tuple[Array, Array]:
     """State probabilities (N, G, M) and expected transitions (D, M, M), given costs (N, G, M).
 
     `new` (N,) commands arrive before each row. The rows are divided into pieces that are computed

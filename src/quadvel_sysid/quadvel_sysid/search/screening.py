@@ -15,8 +15,9 @@ import attrs
 import numpy as np
 
 from quadvel_actuator.effects import EffectLaw, Stage
+from quadvel_description.arrays import Array
 
-from ..data.signals import Array, scattered_rows
+from ..data.signals import scattered_rows
 from ..model.fit import RIDGE
 from ..model.torque_model import MAX_DELAYS_S, AppliedEffect, Model, Unknowns, jacobian, linear_columns
 from ..parallel import parallel_map

@@ -14,8 +14,8 @@ import attrs
 import numpy as np
 
 from quadvel_actuator.effects import EffectLaw
+from quadvel_description.arrays import Array
 
-from ..data.signals import Array
 from ..model.torque_model import AppliedEffect, Model
 from ..statistics.criterion import MIN_EFFECT_SIZE, SIGNIFICANCE_LEVEL
 from .candidates import LAWS, TERMS, Candidates, candidate_key

@@ -10,7 +10,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ..logs.log import Array, Bools, Log
+from quadvel_description.arrays import Array, Bools
+
+from ..logs.log import Log
 
 FILTER_SPAN_S = 0.016
 """s of the past that the filter uses."""

@@ -12,7 +12,8 @@ import attrs
 import numpy as np
 from scipy import stats
 
-from ..data.signals import Array, Bools
+from quadvel_description.arrays import Array, Bools
+
 from ..data.split import DataSplit
 from ..model.delays import delay_flatness
 from ..model.fit import fit, normal_equations, squared_error

@@ -6,7 +6,8 @@ import attrs
 import numpy as np
 from scipy import stats
 
-from ..data.signals import Array, Bools
+from quadvel_description.arrays import Array, Bools
+
 from ..data.split import DataSplit
 
 SIGNIFICANCE_LEVEL = 0.01
