@@ -3,28 +3,51 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = (*sorted((ROOT / "src").glob("quadvel_*/quadvel_*")), ROOT / "training" / "quadvel_training")
-EVERYWHERE = "quadvel_msgs"  # imported by all packages with nodes, as the text says
 PUBLIC_IN_PYTHON = {"_exit", "_getframe", "_replace"}  # documented, in spite of their names
 NO_PUBLIC_WAY = {"_parameter_overrides", "_messages", "_websock_server"}  # of rclpy and viser
-ONLY_BENCH = ("quadvel_eval", "quadvel_training")  # dotted in the diagram
 
 
-def imports(folder: Path) -> set[str]:
-    """The other packages of quadvel that modules in `folder` import, at their top or inside functions."""
-    names = set()
-    for path in folder.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                names |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                names.add(node.module)
-    packages = {name.partition(".")[0] for name in names}
-    return {name for name in packages if name.startswith("quadvel_")} - {folder.name, EVERYWHERE}
+def modules() -> dict[str, Path]:
+    """File of each module by dotted name; a package has the name of its folder."""
+    paths = {
+        ".".join(path.relative_to(folder.parent).with_suffix("").parts): path
+        for folder in FOLDERS
+        for path in folder.rglob("*.py")
+    }
+    return {name.removesuffix(".__init__"): path for name, path in paths.items()}
+
+
+def imported(name: str, path: Path) -> set[str]:
+    """Dotted names that a module imports, at its top or inside functions; `from a import b` gives a and a.b."""
+    package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            start = package[: len(package) + 1 - node.level] if node.level else []
+            module = ".".join([*start, *([node.module] if node.module else [])])
+            found |= {module} | {f"{module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def import_graph() -> dict[str, set[str]]:
+    """Our modules that each of our modules imports.
+
+    A submodule that is imported from its package does not count as an import of the package.
+    """
+    known = modules()
+    graph = {}
+    for name, path in known.items():
+        found = imported(name, path) & known.keys() - {name}
+        graph[name] = {one for one in found if not any(other.startswith(f"{one}.") for other in found)}
+    return graph
 
 
 def arrows() -> set[tuple[str, str]]:
@@ -37,13 +60,23 @@ def arrows() -> set[tuple[str, str]]:
 
 
 def test_the_diagram_of_packages_shows_the_imports() -> None:
-    found = {(folder.name, other) for folder in FOLDERS for other in imports(folder)} - {ONLY_BENCH}
+    found = {
+        (name.partition(".")[0], other.partition(".")[0])
+        for name, others in import_graph().items()
+        for other in others
+    }
+    found = {(package, other) for package, other in found if package != other}
     drawn = arrows()
     assert drawn - found == set()
     reachable = set(drawn)
     while more := {(a, c) for a, b in reachable for b_, c in drawn if b == b_} - reachable:
         reachable |= more
     assert found - reachable == set()
+    assert not {(a, b) for a, b in reachable if (b, a) in reachable}  # imports go one way only
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    graphlib.TopologicalSorter(import_graph()).prepare()  # raises CycleError with the circle
 
 
 def private_names(path: Path) -> set[str]:
