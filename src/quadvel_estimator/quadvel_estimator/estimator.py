@@ -21,6 +21,7 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from quadvel_description.arrays import Array
+from quadvel_description.fields import field
 from quadvel_description.frames import BASE, ODOM, Placed, footprint
 from quadvel_description.kinematics import rotate
 from quadvel_description.state import RobotState
@@ -46,10 +47,6 @@ HEIGHT_VARIANCE = 1e6
 _ANGULAR = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])  # selects the rotations about x, y, z
 
 
-def _parameter(default: Any, description: str) -> Any:
-    return attrs.field(default=default, metadata={"description": description})
-
-
 @attrs.frozen
 class EstimatorParameters(Scheduling):
     """Parameters of the node `estimator`.
@@ -63,20 +60,14 @@ class EstimatorParameters(Scheduling):
         publish_tf: Whether to publish transforms on /tf.
     """
 
-    kind: str = _parameter("learned", f"how velocity is estimated: {' or '.join(KINDS)}")
-    model: str = _parameter("", "file of the learned estimator's network, ONNX; empty: the shipped one")
-    reset_gap: float = _parameter(0.1, "time without a state after which the estimator is reset, s")
-    odom_frame: str = _parameter(ODOM, "frame of the odometry's pose")
-    body_frame: str = _parameter(BASE, "frame of the velocities, the odometry's child")
-    publish_tf: bool = _parameter(
+    kind: str = field("learned", f"how velocity is estimated: {' or '.join(KINDS)}", one_of=KINDS)
+    model: str = field("", "file of the learned estimator's network, ONNX; empty: the shipped one")
+    reset_gap: float = field(0.1, "time without a state after which the estimator is reset, s", above=0.0)
+    odom_frame: str = field(ODOM, "frame of the odometry's pose")
+    body_frame: str = field(BASE, "frame of the velocities, the odometry's child")
+    publish_tf: bool = field(
         True, "whether to publish the transforms of body_frame in odom_frame and of base_footprint"
     )
-
-    def __attrs_post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"kind is {self.kind!r}, expected {' or '.join(KINDS)}")
-        if not self.reset_gap > 0.0:
-            raise ValueError(f"reset_gap is {self.reset_gap}, expected a time above 0 s")
 
     def make_estimator(self) -> Estimator:
         """Create the estimator that `kind` names.

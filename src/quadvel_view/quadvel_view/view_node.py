@@ -20,6 +20,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 
+from quadvel_description.fields import field
 from quadvel_msgs.srv import Push, ResetSim, SetMode
 from quadvel_nodes.node import StartError, read_parameters, run
 from quadvel_recordings.definitions import STORE
@@ -41,11 +42,6 @@ SLOPE_RAD = 0.175
 """Inclination of the terrain "slope" of the page."""
 
 
-def _parameter(default: Any, description: str) -> Any:
-    """Declare a node parameter with its default value and description."""
-    return attrs.field(default=default, metadata={"description": description})
-
-
 @attrs.frozen
 class ViewParameters:
     """Parameters of the node.
@@ -56,15 +52,13 @@ class ViewParameters:
         record_folder: Folder for recordings.
     """
 
-    host: str = _parameter(
+    host: str = field(
         "127.0.0.1", "address on which the page is served; others than this host's need the token"
     )
-    port: int = _parameter(DEFAULT_PORT, "TCP port of the page; 0: any that is free")
-    record_folder: str = _parameter("out", "folder for recordings that the page starts")
-
-    def __attrs_post_init__(self) -> None:
-        if not 0 <= self.port <= MAX_PORT:
-            raise ValueError(f"port is {self.port}, expected 0 to {MAX_PORT}")
+    port: int = field(
+        DEFAULT_PORT, "TCP port of the page; 0: any that is free", at_least=0, at_most=MAX_PORT, whole=True
+    )
+    record_folder: str = field("out", "folder for recordings that the page starts")
 
 
 class View(Node):
