@@ -22,7 +22,7 @@ from quadvel_description.state import JointCommand
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand, Waiting
 from quadvel_msgs.srv import SetMode
-from quadvel_nodes.diagnostics import QUIET, diagnostics
+from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state, seconds, write_low_cmd
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.number_text import number_text
@@ -223,14 +223,14 @@ class Controller(Node):
         for sentence in self._operator_log.walk_refusals():
             log.info(sentence)
         if self._supervisor.duplicate_publisher:
-            log.error(self._supervisor.duplicate_publisher, throttle_duration_sec=QUIET)
+            log.error(self._supervisor.duplicate_publisher, throttle_duration_sec=LOG_THROTTLE_S)
         elif self._loop.state is None:
             if self._reports == SILENCE_LIMIT_S:
                 log.warning(
                     f"{self._missing_state_text()} in {SILENCE_LIMIT_S} s: is a simulator or a driver running?"
                 )
         elif level == DiagnosticStatus.WARN:
-            log.warning(summary, throttle_duration_sec=QUIET)
+            log.warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
 
     def _duplicate_publisher(self) -> str | None:
         """Return a sentence if more than one node publishes states, which fit no single robot, else None."""
