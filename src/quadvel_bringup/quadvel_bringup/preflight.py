@@ -15,6 +15,7 @@ import attrs
 
 import quadvel_dds
 from quadvel_dds.arguments import parse, read_parameter_file
+from quadvel_nodes.parameters import make_record, parameter_fields
 
 from .nodes import NODES
 from .stack import Stack
@@ -101,7 +102,7 @@ def _check(name: str, part: NodeCheck, values: Mapping[str, Any]) -> None:
     """Check names, types and values of the parameters of a node."""
     module, _, record = part.record.partition(":")
     kind = getattr(import_module(module), record)
-    defaults = {field.name: field.default for field in attrs.fields(kind)}
+    defaults = {name: field.default for name, field in parameter_fields(kind).items()}
     for parameter, value in values.items():
         if parameter == "use_sim_time" or parameter.startswith("qos_overrides."):
             continue
@@ -115,6 +116,6 @@ def _check(name: str, part: NodeCheck, values: Mapping[str, Any]) -> None:
             raise ValueError(f"{name}: {parameter} is {value!r}, expected a {expected}")
     given = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items() if key in defaults}
     try:
-        part.make(kind(**given))
+        part.make(make_record(kind, given))
     except ValueError as error:
         raise ValueError(f"{name}: {error.args[0]}") from error
