@@ -19,7 +19,8 @@ from quadvel_policy import command_limits
 from quadvel_policy.command_limits import LIMITS, JointCommandLimiter
 from quadvel_policy.faults import page, table
 from quadvel_policy.guard import Guard, Level
-from quadvel_policy.guards import GUARDS, EncoderInconsistent, ideal_torque
+from quadvel_policy.guards import GUARDS
+from quadvel_policy.guards.legs import EncoderInconsistent, ideal_torque
 from quadvel_policy.supervisor import SUPERVISOR_FAULTS
 from quadvel_policy.tick_input import MotorStatus, TickInput
 

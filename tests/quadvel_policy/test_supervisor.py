@@ -16,7 +16,8 @@ from quadvel_description.robot import COMMAND_UPPER, LIE_Q, NOMINAL_Q, TORQUE_LI
 from quadvel_description.state import MODE_SERVO
 from quadvel_nodes.parameters import make_record, parameter_fields
 from quadvel_policy.control_loop import ControlConfig
-from quadvel_policy.guards import GUARDS, EncoderInconsistent
+from quadvel_policy.guards import GUARDS
+from quadvel_policy.guards.legs import EncoderInconsistent
 from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.transitions import MODES
 

@@ -21,7 +21,9 @@ from .backup_velocity import BackupVelocity, Estimator
 from .command_limits import JointCommandLimiter
 from .config import SupervisorConfig
 from .guard import WALK_MODES, Finding, Guard, GuardInput, GuardSet, Level
-from .guards import GUARDS, AccelerometerImplausible, EstimateStale, EstimateWrong
+from .guards import GUARDS
+from .guards.trunk import AccelerometerImplausible
+from .guards.velocity import EstimateStale, EstimateWrong
 from .modes import Damping, Mode, ModeInput, Policy, Posture, Walk
 from .tick_input import TickInput
 from .transitions import (

@@ -15,7 +15,7 @@ from quadvel_description.robot import JOINT_NAMES
 
 from .config import SupervisorConfig
 from .guard import MOVING_MODES, Finding, Level
-from .guards import DuplicatePublisher
+from .guards.states import DuplicatePublisher
 from .modes import ModeInput, Posture
 from .stop_latch import StopLatch
 from .tick_input import TickInput
@@ -153,7 +153,7 @@ def _stands_on_command(now: Situation) -> str:
 
 
 def _has_braked(now: Situation) -> str:
-    """`brake_time` is over, and the robot stands or 1.8 times that time is over."""
+    """It has braked for `brake_time`, longer if it still moves."""
     braking, limit = now.tick.state.time - now.latch.since, now.config.brake_time
     if braking >= limit and (
         now.speed <= now.config.max_standing_speed or braking >= MAX_BRAKE_TIME_FACTOR * limit
