@@ -126,7 +126,7 @@ class RobotLoop:
         self.simulator = simulator
         self.supervisor = supervisor
         self._estimator = estimator
-        self._beside = dict(shadow_estimators)
+        self._shadow_estimators = dict(shadow_estimators)
         self._mux = CommandMux([_PLANNER])
         self._velocity: Array | None = None
         self._previous_action = np.zeros(12)
@@ -145,7 +145,9 @@ class RobotLoop:
         """
         simulator = self.simulator
         now, state, truth, fallen = simulator.time, simulator.state(), simulator.truth(), simulator.fallen
-        estimates = {name: e.update(state, self._previous_action)[0] for name, e in self._beside.items()}
+        estimates = {
+            name: e.update(state, self._previous_action)[0] for name, e in self._shadow_estimators.items()
+        }
         self._mux.receive(_PLANNER.name, now, velocity)
         mux_output = self._mux.update(now)
         commanded = [*mux_output.velocity, mux_output.stance]

@@ -148,9 +148,9 @@ class ControlLoop:
         )  # s, by which a velocity may be ahead of the state during a stall
         self._robot_time, self._grid = StallFreeClock(), TickGrid(PERIOD_S)
         self._waiting_state: RobotState | None = None  # the state that waits for estimator or mux
-        patience = LOCKSTEP_WAIT_S if sim_time else MAX_STALL_S
-        self._estimator = _LaggingNode(1.5 * PERIOD_S, patience)
-        self._mux = _LaggingNode(0.5 * config.command_timeout if sim_time else math.inf, patience)
+        max_wait = LOCKSTEP_WAIT_S if sim_time else MAX_STALL_S
+        self._estimator = _LaggingNode(1.5 * PERIOD_S, max_wait)
+        self._mux = _LaggingNode(0.5 * config.command_timeout if sim_time else math.inf, max_wait)
         self._answer = JointCommand.damping()
         self._velocity: Stamped | None = None
         self._command: Stamped | None = None

@@ -86,10 +86,10 @@ class Controller(Node):
         self._controller_state = self.create_publisher(ControllerState, "controller/state", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # Best effort suits a robot's driver; a simulator in lockstep waits for the answer to each state.
-        of_states = (
+        state_qos = (
             LATEST_QOS if self._sim_time else QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         )
-        self._states = self.create_subscription(LowState, "low_state", self._on_state, of_states)
+        self._states = self.create_subscription(LowState, "low_state", self._on_state, state_qos)
         self.create_subscription(Waiting, "waiting", self._on_waiting, LATEST_QOS)
         self.create_subscription(
             TwistWithCovarianceStamped, "velocity_estimate", self._on_velocity, LATEST_QOS

@@ -84,7 +84,7 @@ def table() -> list[Row]:
             for guard in GUARDS
         ),
         *(Row(name, *fields) for name, fields in SUPERVISOR_FAULTS.items()),
-        *(Row(name, Level.LIMIT, MOVING_MODES, notices) for name, notices in LIMITS.items()),
+        *(Row(name, Level.LIMIT, MOVING_MODES, condition) for name, condition in LIMITS.items()),
     ]
 
 

@@ -63,7 +63,7 @@ class Situation:
     last: ModeInput | None = None
 
     @property
-    def tick(self) -> ModeInput:
+    def mode_input(self) -> ModeInput:
         """Input of the mode at the last tick, of which there was one."""
         assert self.last is not None
         return self.last
@@ -81,7 +81,7 @@ class Situation:
     @property
     def posture_error(self) -> str:
         """One sentence if a joint is far from the nominal posture, else ""."""
-        error = self.tick.state.q - self.stance.final_posture(self.tick.state)
+        error = self.mode_input.state.q - self.stance.final_posture(self.mode_input.state)
         i, limit = int(np.argmax(np.abs(error))), self.config.max_posture_error
         if abs(error[i]) <= limit:
             return ""
@@ -114,13 +114,13 @@ def _is_off_nominal_posture(now: Situation) -> str:
 
 def _velocity_is_commanded(now: Situation) -> str:
     """A velocity is commanded."""
-    command = now.tick.command
+    command = now.mode_input.command
     return "" if not command[3] and command[:3].any() else "no velocity is commanded"
 
 
 def _velocity_is_known(now: Situation) -> str:
     """The velocity is known."""
-    return "there is no fresh velocity estimate" if now.tick.velocity is None else ""
+    return "there is no fresh velocity estimate" if now.mode_input.velocity is None else ""
 
 
 def _is_not_stopped(now: Situation) -> str:
@@ -147,14 +147,14 @@ def _neutral_was_seen(now: Situation) -> str:
 
 def _stands_on_command(now: Situation) -> str:
     """The robot stands, as commanded."""
-    if now.tick.command[3] and now.speed <= now.config.max_standing_speed:
+    if now.mode_input.command[3] and now.speed <= now.config.max_standing_speed:
         return ""
     return f"the robot walks ({now.speed:.2f} m/s), command stance first"
 
 
 def _has_braked(now: Situation) -> str:
     """It has braked for `brake_time`, longer if it still moves."""
-    braking, limit = now.tick.state.time - now.latch.since, now.config.brake_time
+    braking, limit = now.mode_input.state.time - now.latch.since, now.config.brake_time
     if braking >= limit and (
         now.speed <= now.config.max_standing_speed or braking >= MAX_BRAKE_TIME_FACTOR * limit
     ):

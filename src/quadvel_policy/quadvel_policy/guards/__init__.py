@@ -8,55 +8,33 @@ over the values of walking on flat and rough ground, on randomised plants, and i
 from __future__ import annotations
 
 from ..guard import Guard
-from .legs import (
-    DriveDoesNotAnswer,
-    EncoderFrozen,
-    EncoderInconsistent,
-    FootForceFrozen,
-    JointOutOfRange,
-    JointStuck,
-    JointTooFast,
-    MotorDroppedOut,
-    MotorHot,
-)
-from .states import (
-    AttitudeNotUnit,
-    ControllerStopped,
-    DuplicatePublisher,
-    Overruns,
-    StateBackInTime,
-    StateFrozen,
-    StateNotFinite,
-    StateStale,
-)
-from .trunk import AccelerometerImplausible, ImuFrozen, ImuInconsistent, Tilted
-from .velocity import EstimateStale, EstimateWrong, NoVelocity
+from . import legs, states, trunk, velocity
 
 GUARDS: tuple[type[Guard], ...] = (
-    DuplicatePublisher,
-    StateNotFinite,
-    AttitudeNotUnit,
-    StateBackInTime,
-    ControllerStopped,
-    StateStale,
-    StateFrozen,
-    Tilted,
-    JointOutOfRange,
-    JointTooFast,
-    EncoderInconsistent,
-    EncoderFrozen,
-    ImuInconsistent,
-    DriveDoesNotAnswer,
-    JointStuck,
-    MotorDroppedOut,
-    ImuFrozen,
-    AccelerometerImplausible,
-    MotorHot,
-    Overruns,
-    NoVelocity,
-    EstimateStale,
-    EstimateWrong,
-    FootForceFrozen,
+    states.DuplicatePublisher,
+    states.StateNotFinite,
+    states.AttitudeNotUnit,
+    states.StateBackInTime,
+    states.ControllerStopped,
+    states.StateStale,
+    states.StateFrozen,
+    trunk.Tilted,
+    legs.JointOutOfRange,
+    legs.JointTooFast,
+    legs.EncoderInconsistent,
+    legs.EncoderFrozen,
+    trunk.ImuInconsistent,
+    legs.DriveDoesNotAnswer,
+    legs.JointStuck,
+    legs.MotorDroppedOut,
+    trunk.ImuFrozen,
+    trunk.AccelerometerImplausible,
+    legs.MotorHot,
+    states.Overruns,
+    velocity.NoVelocity,
+    velocity.EstimateStale,
+    velocity.EstimateWrong,
+    legs.FootForceFrozen,
 )
 """Guards in priority order: the first active one is reported, so causes precede their consequences.
 """

@@ -219,6 +219,6 @@ def ideal_torque(command: JointCommand, state: RobotState) -> Array:
     Returns:
         Torques, (12,), N m.
     """
-    asked = command.torque(state.q, state.dq)
-    torque: Array = np.minimum(np.maximum(asked, -TORQUE_LIMIT), TORQUE_LIMIT)
+    requested = command.torque(state.q, state.dq)
+    torque: Array = np.minimum(np.maximum(requested, -TORQUE_LIMIT), TORQUE_LIMIT)
     return torque
