@@ -51,8 +51,8 @@ PIP = {
     "yaml": "pyyaml",
 }
 """Distributions that bring modules; of the module's name unless given"""
-BESIDE = {"setuptools", "quadvel_training"}
-"""Of every setup.py; and what `quadvel bench` measures where it is installed, which no package needs"""
+BESIDE = {"setuptools"}
+"""Of every setup.py"""
 OF_TOOLS = ("test", "ros", "lint")
 """Extras whose packages no source imports"""
 BY_TORCH = {"onnxscript", "tensorboard"}

@@ -16,8 +16,6 @@ import numpy as np
 import quadvel_dds
 
 REQUIRED_PACKAGES = ("mujoco", "onnx", "onnxruntime", "cyclonedds", "rosbags", "mcap", "numpy", "scipy")
-FILE_KEYS = ("actuator", "policy")
-"""Keys of /diagnostics with the files of a node."""
 GL_BACKENDS = ("egl", "osmesa")
 GL_PACKAGES = "libegl1 libopengl0"
 
@@ -59,7 +57,7 @@ def _robot() -> Finding:
     """Check for a running robot and its actuator model."""
     try:
         quadvel_dds.install()
-        from .status import running_nodes
+        from .status import FILE_KEYS, running_nodes
         from .whereabouts import discovery_hint
     except ImportError as error:
         return Finding("robot", True, f"not checked: {error}")
