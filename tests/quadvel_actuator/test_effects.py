@@ -10,7 +10,7 @@ from quadvel_actuator.effects import MemoryLaw, Stage, registry
 from quadvel_actuator.effects.base import evaluate_distinct
 from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.logs.log import Log
-from quadvel_sysid.model.torque_model.torque_model import (
+from quadvel_sysid.model.torque_model import (
     DELAY_STEP_S,
     AppliedEffect,
     Model,

@@ -12,7 +12,7 @@ from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.excerpts import has_jitter, restore_even_clock
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.logs.read_log import read_log
-from quadvel_sysid.model.torque_model.torque_model import AppliedEffect, Model
+from quadvel_sysid.model.torque_model import AppliedEffect, Model
 
 
 def _slewing(rate):
