@@ -18,18 +18,18 @@ from typing import Any
 import attrs
 import numpy as np
 import onnxruntime
-from numpy.typing import ArrayLike
 from onnx import TensorProto, helper
 from rich.table import Table
 from typing_extensions import override
 
 from quadvel_description.robot import NOMINAL_Q
-from quadvel_description.state import JointCommand, RobotState
+from quadvel_description.state import JointCommand
 from quadvel_driver import wire
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_nodes.number_text import number_text
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
+from quadvel_policy.tick_input import TickInput
 from quadvel_sim import Simulator, SimulatorConfig, World
 
 from . import round_trip
@@ -224,11 +224,9 @@ class _TimedSupervisor(Supervisor):
         self.seconds: list[float] = []
 
     @override
-    def tick(
-        self, now: float, state: RobotState, velocity: ArrayLike | None, command: ArrayLike | None
-    ) -> JointCommand:
+    def tick(self, inputs: TickInput) -> JointCommand:
         start = time.perf_counter()
-        answer = super().tick(now, state, velocity, command)
+        answer = super().tick(inputs)
         self.seconds.append(time.perf_counter() - start)
         self.prepare()
         return answer
