@@ -9,7 +9,7 @@ import pytest
 
 from quadvel_description.arrays import Array
 from quadvel_description.fields import field
-from quadvel_description.records import make_record, read_document
+from quadvel_description.records import read_document, structure_record
 
 
 @attrs.frozen(kw_only=True)
@@ -29,7 +29,7 @@ class Cart:
 
 def test_nested_mappings_become_records() -> None:
     content = {"centre": [1, 2], "wheels": [{"radius": "1e0"}, {"radius": 2, "spoke_count": 5}]}
-    cart = make_record(Cart, content)
+    cart = structure_record(Cart, content)
     np.testing.assert_array_equal(cart.centre, [1.0, 2.0])
     assert list(cart.wheels) == [Wheel(radius=1.0), Wheel(radius=2.0, spoke_count=5)]
     assert cart.spare is None
@@ -56,7 +56,7 @@ def test_nested_mappings_become_records() -> None:
 )
 def test_wrong_content_is_refused_with_its_place(content: object, expected: str) -> None:
     with pytest.raises(ValueError, match="expected") as refused:
-        make_record(Cart, content, Path("my.yaml"))
+        structure_record(Cart, content, Path("my.yaml"))
     assert str(refused.value) == f"my.yaml: {expected}"
 
 

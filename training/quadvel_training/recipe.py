@@ -13,7 +13,7 @@ from typing import Any
 import attrs
 
 from quadvel_description.bounded_yaml import read_yaml
-from quadvel_description.records import make_record
+from quadvel_description.records import structure_record
 
 BASE = "base"
 
@@ -38,7 +38,7 @@ def read_recipe(kind: type[Any], path: Path | None) -> Any:
     """
     try:
         fields = read_fields(path) if path else {}
-        record = make_record(kind, _merged(attrs.asdict(kind()), fields), path)
+        record = structure_record(kind, _merged(attrs.asdict(kind()), fields), path)
     except ValueError as error:
         raise RecipeError(str(error)) from None
     return record

@@ -47,7 +47,7 @@ def read_document(path: Path, expected: str, schema: int) -> dict[str, Any]:
     return fields
 
 
-def make_record(kind: type[Record], content: object, path: Path | None = None) -> Record:
+def structure_record(kind: type[Record], content: object, path: Path | None = None) -> Record:
     """Make an attrs record from nested mappings and lists.
 
     Args:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from quadvel_description.arrays import Array
 from quadvel_description.fields import field
-from quadvel_description.records import make_record, read_document
+from quadvel_description.records import read_document, structure_record
 from quadvel_sim.laser import Laser
 from quadvel_sim.terrain import GEOM_NAME
 from quadvel_sim.world_parts import Box, Hill, Patch, Person, Table, Trees, Wall, add_geom, planar_rotation
@@ -112,7 +112,7 @@ class World:
             raise ValueError(
                 f"world {source}: {error.strerror}, expected a YAML file or one of {shipped}"
             ) from None
-        return make_record(cls, {"name": path.stem, **content}, path)
+        return structure_record(cls, {"name": path.stem, **content}, path)
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Compute the height of the ground without the bumps of patches.
