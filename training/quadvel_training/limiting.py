@@ -11,7 +11,7 @@ from quadvel_description.network_file import read_network
 from quadvel_description.recurrent_network import METADATA_KEY
 from quadvel_policy.observation import COMMAND_AXES, VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
-from quadvel_recordings.output import replacing
+from quadvel_recordings.output import atomic_write
 
 
 def limit_commands(policy: Path, limits: VelocityCommandLimits) -> None:
@@ -37,5 +37,5 @@ def limit_commands(policy: Path, limits: VelocityCommandLimits) -> None:
     narrowed = attrs.evolve(metadata, command_limits=bounds, curve_limit=limits.curve)
     model = read_network(policy)
     onnx.helper.set_model_props(model, {METADATA_KEY: narrowed.to_json()})
-    with replacing(policy) as draft:
+    with atomic_write(policy) as draft:
         onnx.save(model, draft)

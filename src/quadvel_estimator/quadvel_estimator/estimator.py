@@ -22,12 +22,12 @@ from tf2_msgs.msg import TFMessage
 
 from quadvel_description.arrays import Array
 from quadvel_description.fields import field
-from quadvel_description.frames import BASE, ODOM, Placed, footprint
+from quadvel_description.frames import BASE, ODOM, FramePose, footprint
 from quadvel_description.kinematics import rotate
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
-from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state
+from quadvel_nodes.messages import MessageError, Refusals, read_low_state, read_numbers
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transform_messages
 from quadvel_nodes.scheduling import Scheduling
@@ -113,7 +113,7 @@ class EstimatorNode(Node):
     def _on_command(self, message: Any) -> None:
         try:
             self._tracker.set_previous_action(
-                features.previous_action(numbers(message, "q", 12), message.mode)
+                features.previous_action(read_numbers(message, "q", 12), message.mode)
             )
         except MessageError as error:
             self._refusals.add("low_cmd", error)
@@ -163,7 +163,7 @@ class EstimatorNode(Node):
         self._odom.publish(message)
         if self._settings.publish_tf:
             frames = self._settings
-            base = Placed(frames.odom_frame, frames.body_frame, position, state.quaternion)
+            base = FramePose(frames.odom_frame, frames.body_frame, position, state.quaternion)
             below = attrs.evolve(floor, parent=frames.body_frame)
             self._tf.publish(TFMessage(transforms=transform_messages(stamp, [base, below])))
 

@@ -26,12 +26,12 @@ from quadvel_nodes.node import StartError, read_parameters, run
 from quadvel_recordings.definitions import STORE
 
 from .operator import PUBLISH_PERIOD_S, Operator
+from .page_protocol import Allow, Hold, LetGo, ModeRequest, PageMessage, Record, Release, Reset, Stop
+from .page_protocol import Push as PushWord
 from .picture import LATCHED, TOPICS, RobotPicture
 from .recording import PageRecorder
 from .server import AddressError
 from .viewer import DEFAULT_PORT, FRAME_PERIOD_S, MAX_PORT, Viewer
-from .words import Allow, Hold, LetGo, ModeRequest, PageMessage, Record, Release, Reset, Stop
-from .words import Push as PushWord
 
 LATCHED_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATEST_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
