@@ -6,7 +6,6 @@ import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -18,6 +17,7 @@ from typer.core import TyperCommand
 from typing_extensions import override
 
 from quadvel_actuator.parameters import ActuatorParameters
+from quadvel_recordings.output import output_folder
 
 from .logs.checks import Inspection
 from .logs.columns import ColumnMap
@@ -181,7 +181,7 @@ def _run(
     messages: Console,
 ) -> None:
     """Read the logs, identify the model, write the report and print a summary."""
-    _check_folder(out)
+    output_folder(out)
     names = ColumnMap() if columns is None else ColumnMap.load(columns)
     return_large_arrays()
     parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
@@ -289,17 +289,6 @@ def print_findings(inspection: Inspection, messages: Console) -> None:
     for finding in inspection.findings:
         line = f"  {finding.kind:8} {finding.text}"
         messages.print(escape(line), style=STYLE[finding.kind], soft_wrap=True, highlight=False)
-
-
-def _check_folder(out: Path) -> None:
-    """Raise OSError if `out` cannot become a writable folder; the test file is deleted."""
-    there = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
-    if not there.is_dir():
-        raise NotADirectoryError(f"{out}: is a file or lies below one, expected a folder")
-    try:
-        TemporaryFile(dir=there).close()
-    except OSError as error:
-        raise type(error)(f"{out}: the folder is not writable: {error.strerror}") from None
 
 
 def main() -> None:
