@@ -72,7 +72,7 @@ def _infer_shapes(model: Message, names: set[str]) -> Shapes:
     options = onnxruntime.SessionOptions()
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     options.log_severity_level = 4
-    outputs = [message("ValueInfoProto", name=name) for name in sorted(names)]
+    outputs = [message("ValueInfoProto", name=name) for name in sorted(names - {""})]
     graph = attrs.evolve(model.one("graph"), fields=model.one("graph").fields | {"output": outputs})
     asking = attrs.evolve(model, fields=model.fields | {"graph": [graph]})
     session = onnxruntime.InferenceSession(serialise(asking), options, providers=["CPUExecutionProvider"])
