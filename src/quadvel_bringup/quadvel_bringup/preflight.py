@@ -16,7 +16,7 @@ import attrs
 import quadvel_dds
 from quadvel_dds.arguments import parse, read_parameter_file
 
-from .nodes import NODES
+from .nodes import NODES, installed_node
 from .stack import Stack
 
 
@@ -80,6 +80,7 @@ def check_node(name: str, arguments: Sequence[str]) -> None:
         name: The node.
         arguments: Its arguments of ROS 2.
     """
+    installed_node(name)
     _check(name, NODE_CHECKS[name], parse(arguments).parameters_for(f"/{name}"))
 
 
