@@ -8,7 +8,6 @@ import quadvel_dds
 
 from .exclusivity import ensure_exclusive
 from .node_output import PrefixedOutput
-from .nodes import process_command
 from .page_watch import PageWatch
 from .preflight import check_stack
 from .processes import ProcessGroup, StopSignals
@@ -33,13 +32,13 @@ def up(stack: Stack, view: bool = False) -> int:
     check_stack(stack)
     if stack.brings_robot:
         check_exclusive()
-    nodes = stack.arguments(view)
+    nodes = stack.commands(view)
     say = PrefixedOutput(["quadvel", *nodes], Console(soft_wrap=True))
     with StopSignals() as signals, ProcessGroup(say) as group:
         say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them, `quadvel status` shows their health")
-        for name, arguments in nodes.items():
+        for name, command in nodes.items():
             if not signals.received:
-                group.start(name, process_command(name, arguments))
+                group.start(name, command)
         watch, ended = PageWatch(group, say), dict[str, int]()
         while not ended and not signals.wait(0.1):
             ended = watch.ended()

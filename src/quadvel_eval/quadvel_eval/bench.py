@@ -18,10 +18,10 @@ from typing import Any
 import attrs
 import numpy as np
 import onnxruntime
-from onnx import TensorProto, helper
 from rich.table import Table
 from typing_extensions import override
 
+from quadvel_description.onnx_format import float_value, message, serialise
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
@@ -177,11 +177,16 @@ def bench_policy() -> dict[str, Any]:
 
 def _idle_network() -> Callable[[], object]:
     """Return a function that runs the smallest network: the identity of one number."""
-    number = helper.make_tensor_value_info("x", TensorProto.FLOAT, [1])
-    same = helper.make_tensor_value_info("y", TensorProto.FLOAT, [1])
-    graph = helper.make_graph([helper.make_node("Identity", ["x"], ["y"])], "idle", [number], [same])
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    graph = message(
+        "GraphProto",
+        node=message("NodeProto", input="x", output="y", op_type="Identity"),
+        name="idle",
+        input=float_value("x", [1]),
+        output=float_value("y", [1]),
+    )
+    opset = message("OperatorSetIdProto", version=17)
+    model = message("ModelProto", ir_version=8, graph=graph, opset_import=opset)
+    session = onnxruntime.InferenceSession(serialise(model), providers=["CPUExecutionProvider"])
     x = {"x": np.zeros(1, np.float32)}
     return lambda: session.run(None, x)
 
