@@ -15,6 +15,9 @@ from typing import Any
 import attrs
 import numpy as np
 
+Numbers = float | tuple[float, ...]
+"""One number, or several."""
+
 
 def field(
     default: Any = attrs.NOTHING,
@@ -31,7 +34,7 @@ def field(
     """Declare a field of an attrs class.
 
     With a bound, the value is a finite number or several; -inf is a bound, too. Whole numbers become
-    floats unless `whole` is set.
+    floats unless `whole` is set, and lists become tuples.
 
     Args:
         default: Default value, or `attrs.Factory`; without it, the field is required. If it is
@@ -110,7 +113,9 @@ def to_array(size: int | None, value: Any) -> Any:
 
 
 def _to_float(value: Any) -> Any:
-    """Convert an integer to a float, and leave anything else for the validator."""
+    """Convert an integer to a float, a list to a tuple, and leave anything else for the validator."""
+    if isinstance(value, list):
+        return tuple(value)
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 

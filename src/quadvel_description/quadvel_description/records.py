@@ -10,10 +10,11 @@ from typing import Any, TypeVar, get_origin
 import attrs
 import cattrs
 import numpy as np
-from cattrs.cols import is_sequence, list_structure_factory
+from cattrs.cols import is_mapping, is_sequence, list_structure_factory
 from cattrs.gen import make_dict_structure_fn
 
 from .bounded_yaml import read_yaml
+from .fields import Numbers
 
 Record = TypeVar("Record")
 PLAIN_TYPES: Mapping[type, tuple[tuple[type, ...], str]] = {
@@ -101,15 +102,21 @@ def _record_hook(kind: type, converter: cattrs.Converter) -> Any:
 
 
 def _list_hook(kind: type, converter: cattrs.Converter) -> Any:
-    """Structure a sequence from a list."""
+    """Structure a sequence from a list; it becomes a tuple unless the type is a list."""
     structure = list_structure_factory(kind, converter)
+    made = list if get_origin(kind) is list else tuple
 
     def checked(value: object, _: Any) -> Any:
         if not isinstance(value, list | tuple):
             raise ValueError(f"found {value!r}, expected a list")
-        return structure(value, kind)
+        return made(structure(value, kind))
 
     return checked
+
+
+def _numbers(value: Any, _: Any) -> Any:
+    """Structure `Numbers`: one number, or a tuple of them from a list."""
+    return _CONVERTER.structure(value, tuple[float, ...] if isinstance(value, list | tuple) else float)
 
 
 def _is_array(kind: Any) -> bool:
@@ -131,6 +138,8 @@ def _plain(value: Any, kind: type) -> Any:
 _CONVERTER = cattrs.Converter()
 _CONVERTER.register_structure_hook_factory(attrs.has, _record_hook)
 _CONVERTER.register_structure_hook_factory(is_sequence, _list_hook)
+_CONVERTER.register_structure_hook_func(is_mapping, lambda value, _: dict(_mapping(value)))
+_CONVERTER.register_structure_hook_func(lambda kind: kind == Numbers, _numbers)
 _CONVERTER.register_structure_hook_func(_is_array, lambda value, _: value)  # the field converts it
 for _kind in PLAIN_TYPES:
     _CONVERTER.register_structure_hook(_kind, _plain)
