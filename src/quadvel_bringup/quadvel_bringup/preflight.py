@@ -19,7 +19,7 @@ import quadvel_dds
 from quadvel_dds.arguments import InvalidROSArgsError, ParameterOverride, parse, read_parameter_file
 from quadvel_nodes.parameters import make_record, parameter_fields
 
-from .nodes import NODES, node_entry
+from .nodes import NODES, installed_node, node_entry
 from .stack import PARAMETERS, Stack
 
 RCLPY_PARAMETERS = ("use_sim_time", "start_type_description_service")
@@ -86,6 +86,7 @@ def check_node(name: str, arguments: Sequence[str]) -> None:
         name: The node.
         arguments: Its arguments of ROS 2.
     """
+    installed_node(name)
     _check(name, NODE_CHECKS[name], parse(arguments).parameters_for(f"/{name}"))
 
 
