@@ -422,8 +422,10 @@ LIMITS = [
 def test_a_limit_that_protects_nothing_is_refused_with_the_value_and_the_bound(
     field: str, value: float
 ) -> None:
-    found = re.escape(f"{field} is {value}")
-    with pytest.raises(ValueError, match=f"^{found}, expected above 0 and at most [0-9.]+$"):
+    found = rf"^\w+\.{field}: found {re.escape(str(value))}"
+    with pytest.raises(
+        ValueError, match=f"{found}, expected (a whole number, )?above 0 and at most [0-9.]+$"
+    ):
         make_record(ControlConfig, {field: value})
 
 

@@ -13,6 +13,7 @@ from rclpy.node import Node
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 
+from quadvel_description.fields import field
 from quadvel_msgs.msg import VelocityCommand
 from quadvel_nodes.diagnostics import diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, seconds
@@ -20,7 +21,6 @@ from quadvel_nodes.node import read_parameters, run
 
 from .command_mux import CommandMux, MuxConfig, MuxInput, MuxOutput
 from .received import StampCheck, planar_velocity
-from .settings import setting
 
 PERIOD_S = 0.02  # period of the topic `command`
 
@@ -41,18 +41,18 @@ class MuxParameters(MuxConfig):
         ValueError: The lists have different lengths; raised by the constructor.
     """
 
-    names: tuple[str, ...] = setting(("teleop", "follow", "planner"), "name of each input")
-    topics: tuple[str, ...] = setting(("cmd_vel_teleop", "cmd_vel_follow", "cmd_vel"), "topic of each input")
-    priorities: tuple[int, ...] = setting((100, 50, 10), "priority of each input, the highest wins")
-    timeouts: tuple[float, ...] = setting((0.5, 0.15, 0.5), "silence after which each input is out, s")
-    lock_topics: tuple[str, ...] = setting(("command_lock",), "std_msgs/Bool topics: true stops the robot")
-    stamped: bool = setting(False, "inputs are TwistStamped instead of Twist")
+    names: tuple[str, ...] = field(("teleop", "follow", "planner"), "name of each input")
+    topics: tuple[str, ...] = field(("cmd_vel_teleop", "cmd_vel_follow", "cmd_vel"), "topic of each input")
+    priorities: tuple[int, ...] = field((100, 50, 10), "priority of each input, the highest wins")
+    timeouts: tuple[float, ...] = field((0.5, 0.15, 0.5), "silence after which each input is out, s")
+    lock_topics: tuple[str, ...] = field(("command_lock",), "std_msgs/Bool topics: true stops the robot")
+    stamped: bool = field(False, "inputs are TwistStamped instead of Twist")
 
     def __attrs_post_init__(self) -> None:
-        for field in ("topics", "priorities", "timeouts"):
-            found = len(getattr(self, field))
+        for name in ("topics", "priorities", "timeouts"):
+            found = len(getattr(self, name))
             if found != len(self.names):
-                raise ValueError(f"{field} has {found} entries, expected {len(self.names)} as names has")
+                raise ValueError(f"{name} has {found} entries, expected {len(self.names)} as names has")
 
     def inputs(self) -> list[MuxInput]:
         """Return the inputs, in the order of the lists.

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadvel_description.arrays import Array
+from quadvel_description.fields import field
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_nodes.messages import MessageError
 from quadvel_nodes.stall_free_clock import StallFreeClock
@@ -32,7 +33,6 @@ from .guard import FALL_TIME_S
 from .loop_stats import LoopStats
 from .observation import RATE_HZ
 from .received import StampCheck
-from .settings import setting
 from .stall_detector import StallDetector
 from .supervisor import Supervisor
 from .tick_input import TickInput
@@ -61,13 +61,14 @@ class ControlConfig:
     """Parameters of the supervisor, and age limits of its inputs; each is a node parameter."""
 
     supervisor: SupervisorConfig = SupervisorConfig()
-    max_velocity_age: float = setting(
+    max_velocity_age: float = field(
         0.05,
         "oldest velocity estimate that is used; after that the Kalman filter replaces it, s",
+        above=0.0,
         at_most=FALL_TIME_S,
     )
-    command_timeout: float = setting(
-        0.5, "oldest command that is used; after that the robot stands, s", at_most=FALL_TIME_S
+    command_timeout: float = field(
+        0.5, "oldest command that is used; after that the robot stands, s", above=0.0, at_most=FALL_TIME_S
     )
 
 

@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool
 
+from quadvel_description.fields import field
 from quadvel_description.state import JointCommand
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand, Waiting
@@ -39,7 +40,6 @@ from .control_loop import WATCH_PERIOD_S, ControlConfig, ControlLoop
 from .operator_log import OperatorLog
 from .policy_file import SHIPPED_POLICY, PolicyFile
 from .received import linear_velocity, planar_velocity
-from .settings import setting
 from .supervisor import Supervisor
 from .tick_input import MotorStatus as Motors
 from .transitions import MODES
@@ -58,7 +58,7 @@ class ControllerParameters:
 
     scheduling: Scheduling = Scheduling()
     control: ControlConfig = ControlConfig()
-    policy: str = setting("", "ONNX file of the policy; empty: the one that is shipped")
+    policy: str = field("", "ONNX file of the policy; empty: the one that is shipped")
 
 
 class Controller(Node):
