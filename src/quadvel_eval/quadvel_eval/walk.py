@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from quadvel_actuator import ActuatorParameters
 from quadvel_description import robot
 from quadvel_description.arrays import Array, Bools
+from quadvel_description.fields import field
 from quadvel_description.kinematics import rotate, yaw
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL
@@ -49,7 +50,7 @@ class Setup:
     policy: Path = SHIPPED_POLICY
     estimator: str = "learned"
     estimator_file: Path = SHIPPED_MODEL
-    terrain: str = attrs.field(default="flat", validator=attrs.validators.in_(TERRAINS))
+    terrain: str = field("flat", one_of=TERRAINS)
     randomised: bool = False
     actuator: Path | None = None
     plant: Mapping[str, Any] = attrs.field(factory=dict)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
 
 import attrs
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 
 from quadvel_description.arrays import Array, Bools
+from quadvel_description.fields import field
 
 from .clusters import Scan
 from .free_space import MEMORY_S, MIN_AGE_S, ScanHistory, check_places, to_frame, to_sensor
@@ -56,14 +56,6 @@ PERSON_OFFSETS_M = np.array([-0.2, -0.1, 0.0, 0.1, 0.2])
 """Lateral offsets at which a person's place is checked."""
 
 
-def _positive(default: float) -> Any:
-    def check(_: object, field: Any, value: float) -> None:
-        if not 0.0 < value < np.inf:
-            raise ValueError(f"{field.name} is {value}, expected a finite number above 0")
-
-    return attrs.field(default=default, validator=check)
-
-
 @attrs.frozen
 class TrackerConfig:
     """Parameters of the tracker.
@@ -91,23 +83,23 @@ class TrackerConfig:
         forgotten: Time without a leg after which an unconfirmed hypothesis is removed, s.
     """
 
-    acceleration: float = _positive(0.1)
-    both_legs: float = _positive(0.1)
-    one_leg: float = _positive(0.3)
-    first_speed: float = _positive(0.8)
-    reach: float = _positive(0.9)
-    possible: float = _positive(0.15)
-    walked: float = _positive(0.5)
-    moved: float = _positive(0.55)
-    surprise: float = _positive(0.22)
-    pairs: float = _positive(0.3)
-    belief: float = _positive(0.6)
-    watched: float = _positive(1.0)
-    sightings: int = _positive(8)
-    steady: float = _positive(0.7)
-    patience: float = _positive(3.0)
-    patience_in_view: float = _positive(1.5)
-    forgotten: float = _positive(0.5)
+    acceleration: float = field(0.1, above=0.0)
+    both_legs: float = field(0.1, above=0.0)
+    one_leg: float = field(0.3, above=0.0)
+    first_speed: float = field(0.8, above=0.0)
+    reach: float = field(0.9, above=0.0)
+    possible: float = field(0.15, above=0.0)
+    walked: float = field(0.5, above=0.0)
+    moved: float = field(0.55, above=0.0)
+    surprise: float = field(0.22, above=0.0)
+    pairs: float = field(0.3, above=0.0)
+    belief: float = field(0.6, above=0.0)
+    watched: float = field(1.0, above=0.0)
+    sightings: int = field(8, above=0.0, whole=True)
+    steady: float = field(0.7, above=0.0)
+    patience: float = field(3.0, above=0.0)
+    patience_in_view: float = field(1.5, above=0.0)
+    forgotten: float = field(0.5, above=0.0)
 
 
 def deviation(covariance: Array) -> float:

@@ -9,6 +9,7 @@ from geometry_msgs.msg import Twist
 from rclpy.node import Node
 from std_msgs.msg import String
 
+from quadvel_description.fields import field
 from quadvel_eval.script import SCRIPTS, ScriptError, ScriptRunner, Velocity
 from quadvel_msgs.msg import ControllerState
 from quadvel_msgs.srv import SetMode
@@ -25,13 +26,7 @@ class PlannerParameters:
         script: Name of the script, a key of SCRIPTS.
     """
 
-    script: str = attrs.field(
-        default="full", metadata={"description": f"which script is walked: {' or '.join(SCRIPTS)}"}
-    )
-
-    def __attrs_post_init__(self) -> None:
-        if self.script not in SCRIPTS:
-            raise ValueError(f"script is {self.script!r}, expected {' or '.join(SCRIPTS)}")
+    script: str = field("full", f"which script is walked: {' or '.join(SCRIPTS)}", one_of=SCRIPTS)
 
 
 class ScriptedPlanner(Node):

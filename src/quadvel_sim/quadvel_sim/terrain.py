@@ -77,7 +77,7 @@ class Terrain:
         seed: Seed of rough ground.
     """
 
-    kind: str = attrs.field(default="flat")
+    kind: str = field("flat", one_of=KINDS)
     slope: float = field(0.0, at_least=-0.8, at_most=0.8)
     roughness: float = field(0.06, at_least=0.001, at_most=1.0)
     wavelength: float = field(0.6, at_least=0.1, at_most=10.0)
@@ -87,8 +87,6 @@ class Terrain:
     seed: int = field(0, at_least=0, whole=True)
 
     def __attrs_post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"Terrain.kind: found {self.kind!r}, expected one of {', '.join(KINDS)}")
         if self.kind == "flat" and self.slope != 0.0:
             raise ValueError(f"Terrain.slope: found {self.slope} rad with kind 'flat', expected 0")
 
