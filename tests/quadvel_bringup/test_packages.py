@@ -20,6 +20,7 @@ ROSDEP = {
     "attrs": "python3-attr",
     "evdev": "python3-evdev",
     "google": "python3-protobuf",
+    "jinja2": "python3-jinja2",
     "lz4": "python3-lz4",
     "matplotlib": "python3-matplotlib",
     "numba": "python3-numba",
@@ -39,7 +40,7 @@ PIP = {
     **dict.fromkeys(
         ("matplotlib", "numba", "numpy", "onnxscript", "rich", "rosbags", "scipy", "tensorboard"), ""
     ),
-    **dict.fromkeys(("h5py", "lz4", "msgspec", "pyarrow"), ""),
+    **dict.fromkeys(("h5py", "jinja2", "lz4", "msgspec", "pyarrow"), ""),
     **dict.fromkeys(
         ("attrs", "evdev", "threadpoolctl", "torch", "trimesh", "typer", "viser", "websockets"), ""
     ),
