@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import pytest
+import attrs
 
-from quadvel_sysid.model.torque_model import fit
-from quadvel_sysid.search import candidates
-from tests.identification.ablation import BASELINE, SWITCHES, table, without
+from quadvel_sysid.options import DEVICES, Devices
+from tests.identification.ablation import BASELINE, SWITCHES, devices_without, table
 
 
-@pytest.mark.parametrize("switch", SWITCHES)
-def test_a_switch_replaces_existing_names_and_restores_them(switch: str) -> None:
-    before = candidates.MAX_FITTED_LAWS, fit._FAR_DELAY_CHANGES_S
-    with without(switch):
-        pass
-    assert before == (candidates.MAX_FITTED_LAWS, fit._FAR_DELAY_CHANGES_S)
+def test_every_device_has_a_switch_that_disables_it() -> None:
+    assert devices_without(BASELINE) == DEVICES
+    assert all(devices_without(switch) != DEVICES for switch in SWITCHES if switch != BASELINE)
+    assert {name for fields in SWITCHES.values() for name in fields} == {
+        field.name for field in attrs.fields(Devices)
+    }
 
 
 def test_joined_switches_disable_all_devices() -> None:
-    with without("half as many fits+far delays"):
-        assert (candidates.MAX_FITTED_LAWS, fit._FAR_DELAY_CHANGES_S) == (3, ())
+    devices = devices_without("half as many fits+far delays")
+    assert (devices.fitted_laws, devices.far_delays) == (3, False)
 
 
 def test_the_table_counts_changed_verdicts() -> None:

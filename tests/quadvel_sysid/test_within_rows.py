@@ -12,7 +12,7 @@ from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.excerpts import has_jitter, restore_even_clock
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.logs.read_log import read_log
-from quadvel_sysid.model.torque_model.torque_model import AppliedEffect, Model
+from quadvel_sysid.model.torque_model import AppliedEffect, Model
 
 
 def _slewing(rate):
@@ -41,7 +41,7 @@ def test_a_slew_limit_is_simulated_between_rows():
     one = np.zeros(1, dtype=np.intp)
     gains = np.array([[30.0], [0.0]])
     limit = AppliedEffect(law, np.ones(1, dtype=bool), np.array([[rate]]), one)
-    model = Model(Samples([log]), 0.0, gains, one, np.zeros((2, 1)), one, (limit,))
+    model = Model(Samples.of([log]), 0.0, gains, one, np.zeros((2, 1)), one, (limit,))
     limited = np.abs(asked - tau) > 0.05
     assert limited.mean() > 0.2
     assert np.sqrt(np.mean((model.predict()[:, 0] - tau)[10:] ** 2)) < 0.008
@@ -52,7 +52,7 @@ def _of_one_joint(log, law, value, input_delay=0.0):
     applied = AppliedEffect(law, np.ones(1, dtype=bool), np.array([[value]]), one)
     gains = np.array([[30.0], [1.0]])
     delays = np.array([[input_delay], [0.0]])
-    return Model(Samples([log]), 0.0, gains, one, delays, one, (applied,))
+    return Model(Samples.of([log]), 0.0, gains, one, delays, one, (applied,))
 
 
 def test_a_lag_is_recomputed_at_other_delays_with_the_same_commands():

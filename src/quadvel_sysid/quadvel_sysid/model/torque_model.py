@@ -23,7 +23,7 @@ from quadvel_actuator.effects import DRIVE, AddedLaw, EffectLaw, ErrorLaw, Memor
 from quadvel_actuator.effects.base import distinct_indices
 from quadvel_description.arrays import Array, Bools, Indices
 
-from ..data.signals import INSTANTS_PER_ROW, Samples, Signals
+from ..data.signals import Samples, Signals
 
 MAX_DELAYS_S = np.array([0.020, 0.006])
 """Upper bounds of the input delay and of the output delay, s."""
@@ -183,8 +183,11 @@ class Model:
             Torque, (B, N, J), N m.
         """
         if self.window == 0.0 and any(effect.law.acts_between_rows for effect in self.effects):
-            upsampled = attrs.evolve(self, samples=self.samples.upsampled)
-            return upsampled._evaluate(gains, values)[..., INSTANTS_PER_ROW - 1 :: INSTANTS_PER_ROW, :]
+            upsampled, each = (
+                attrs.evolve(self, samples=self.samples.upsampled),
+                self.samples.instants_per_row,
+            )
+            return upsampled._evaluate(gains, values)[..., each - 1 :: each, :]
         return self._evaluate(gains, values)
 
     def _evaluate(self, gains: Array, values: Sequence[Array]) -> Array:

@@ -20,10 +20,6 @@ from .fitted_model import FittedModel
 from .library import Context, SignalTerm
 from .screening import CandidateScreening, ScreenedCandidate, promising
 
-MAX_FITTED_LAWS, MAX_FITTED_TERMS = 6, 4
-"""Laws, and regressors of named signals, that are fitted after a screening."""
-MAX_SHARED_TRIALS = 3
-"""Best candidates for which sharing across joints is tried."""
 LAWS, TERMS = "laws", "terms"
 Law = TypeVar("Law", bound=EffectLaw)
 Result = TypeVar("Result")
@@ -39,8 +35,9 @@ class Candidates:
             before: Model to extend.
             only: Keys (`candidate_key`) of the candidates to consider; all if None.
         """
-        self._before, self._evaluator, self._only = before, before.evaluator, only
-        self._context = Context(before.model, before.evaluator.parts, before.evaluator.noise)
+        evaluator = before.evaluator
+        self._before, self._evaluator, self._only, self._devices = before, evaluator, only, evaluator.devices
+        self._context = Context(before.model, evaluator.parts, evaluator.noise, evaluator.devices)
 
     def _filtered(self, candidates: Iterable[Law]) -> Iterator[Law]:
         """The candidates to consider."""
@@ -73,22 +70,24 @@ class Candidates:
             if several or not one.confounded_with_gain
         )
         count = len({one.law.name for one in found}) or 1
-        return self._fit_screened(_first_distinct(promising(found), MAX_FITTED_LAWS)), count
+        return self._fit_screened(_first_distinct(promising(found), self._devices.fitted_laws)), count
 
     @cached_property
     def _terms(self) -> tuple[list[FittedModel], int]:
         """The best regressors, refined and fitted, and the number of screened sets of signals."""
         found = self._screening.screen_terms(list(self._filtered(library.term_candidates(self._context))))
-        best = _first_distinct(promising(found), MAX_FITTED_TERMS)
-        finer = self._parallel_map(lambda k: _refine_term(best[k], self._screening), len(best))
-        best += [one for one in finer if one not in best]
+        best = _first_distinct(promising(found), self._devices.fitted_terms)
+        if self._devices.finer_terms:
+            finer = self._parallel_map(lambda k: _refine_term(best[k], self._screening), len(best))
+            best += [one for one in finer if one not in best]
         return self._fit_screened(best), len({candidate_key(one.law) for one in found})
 
     def _fit_screened(self, chosen: Sequence[ScreenedCandidate]) -> list[FittedModel]:
         """Fit the candidates, and share the values of the best ones across joints."""
         fitted = self._fit_parallel(lambda k: self._fit_candidate(chosen[k]), len(chosen))
         fitted.sort(key=lambda one: one.criterion)
-        best, others = fitted[:MAX_SHARED_TRIALS], fitted[MAX_SHARED_TRIALS:]
+        tried = self._devices.shared_trials
+        best, others = fitted[:tried], fitted[tried:]
         last = len(self._context.model.effects)
         return (
             self._fit_parallel(
@@ -100,7 +99,7 @@ class Candidates:
 
     def _refit_near_delays(self, fitted: FittedModel) -> FittedModel:
         """Refit a regressor from nearby delays if that is better; its screening used one pair."""
-        if not isinstance(fitted.last_effect.law, SignalTerm):
+        if not (self._devices.terms_at_nearby_delays and isinstance(fitted.last_effect.law, SignalTerm)):
             return fitted
         other = FittedModel(fit_near_delays(fitted.model, self._evaluator.parts.fit), self._evaluator)
         return min(fitted, other, key=lambda one: one.criterion)
@@ -115,7 +114,9 @@ class Candidates:
     def _fit_candidate(self, candidate: ScreenedCandidate) -> Model:
         """Fit a candidate on all joints, and on those where it is significant if that is better."""
         evaluator, model, law = self._evaluator, candidate.model, candidate.law
-        near = model.with_delays(self._before.model.delays)
+        near, last = model.with_delays(self._before.model.delays), len(model.effects) - 1
+        if not self._devices.second_starts:
+            return evaluator.restrict_joints(evaluator.fit(model), last).model
         if law.confounded_with_gain:
             # A value that all joints share is a change of a gain or a delay. One joint without the
             # effect makes the fit unique.
@@ -123,7 +124,7 @@ class Candidates:
             model, near = (_drop_weakest_joint(fit(start, rows, 4, delays=False)) for start in (model, near))
         starts = [model, near] if law.shifts or law.confounded_with_gain else [model]
         fitted = min((evaluator.fit(start) for start in starts), key=lambda one: one.criterion)
-        return evaluator.restrict_joints(fitted, len(fitted.model.effects) - 1).model
+        return evaluator.restrict_joints(fitted, last).model
 
 
 def _refine_term(candidate: ScreenedCandidate, screening: CandidateScreening) -> ScreenedCandidate:

@@ -37,6 +37,7 @@ from quadvel_description.arrays import Array, Bools
 from ..data.signals import Signals
 from ..data.split import DataSplit
 from ..model.torque_model import AppliedEffect, Model
+from ..options import DEVICES, Devices
 from .lost_commands import lost_commands
 
 _CACHE_SIZE = 12
@@ -44,8 +45,6 @@ _CACHE_SIZE = 12
 _regressor_cache: dict[tuple[Any, ...], tuple[Shape, Signals, Array]] = {}
 """Cached regressors, most recent last. Entries keep the objects alive whose `id` is in the key."""
 _DRIVE_SIGNALS = "q_des", "error", "tau"
-_MEMORY_COST = 0.5
-"""Further cost, in parameters, of a law with memory or one that resembles a delay."""
 _SIGNAL_COST = 5.0
 """Cost, in parameters, of each signal of a regressor. Its penalised weights cost nothing."""
 
@@ -214,16 +213,17 @@ def _causal_signals(s: Signals) -> Signals:
     return attrs.evolve(s, slope=lambda name: slope)
 
 
-def complexity(law: EffectLaw) -> float:
+def complexity(law: EffectLaw, memory_cost: float) -> float:
     """Return the cost of a law in the criterion.
 
     Args:
         law: The law.
+        memory_cost: Further parameters that a law with memory, or one like a delay, counts as.
 
     Returns:
         Equivalent number of parameters per joint; laws with memory cost more.
     """
-    past = _MEMORY_COST if law.shifts or law.has_memory else 0.0
+    past = memory_cost if law.shifts or law.has_memory else 0.0
     return float(getattr(law, "complexity", len(law.parameters) + past))
 
 
@@ -234,21 +234,23 @@ class Context:
         model: Model that the law would extend.
         parts: Data split.
         noise: Variance of the torque noise, (J,), N^2 m^2.
+        devices: Devices of the search.
         samples: Rows of all logs.
         signals: Signals at the delays of the model.
         torque: Predicted torque, (N, J), N m.
         residual: Measured minus predicted torque on the fitted rows, 0 elsewhere, (N, J), N m.
     """
 
-    def __init__(self, model: Model, parts: DataSplit, noise: Array) -> None:
+    def __init__(self, model: Model, parts: DataSplit, noise: Array, devices: Devices = DEVICES) -> None:
         """Evaluate the model.
 
         Args:
             model: Model that a law would extend.
             parts: Data split.
             noise: Variance of the torque noise, (J,), N^2 m^2.
+            devices: Devices of the search.
         """
-        self.model, self.parts, self.noise = model, parts, noise
+        self.model, self.parts, self.noise, self.devices = model, parts, noise, devices
         self.samples, self.signals = model.samples, model.signals
         self.torque = model.predict()
         self.residual = np.where(parts.fit, self.samples.tau - self.torque, 0.0)
@@ -256,7 +258,7 @@ class Context:
     @cached_property
     def lost_commands(self) -> list[tuple[Array, Array]]:
         """Odds that commands were lost, from `lost_commands.lost_commands`."""
-        return lost_commands(self.model, self.parts, self.noise)
+        return lost_commands(self.model, self.parts, self.noise, self.devices.lost_commands_at_random)
 
     def strongest_neighbours(self) -> tuple[str, ...]:
         """Find for each joint the signal of another joint that its residual correlates with most.

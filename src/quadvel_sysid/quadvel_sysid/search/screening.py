@@ -28,6 +28,8 @@ _TOTAL_DELAY_CHANGES_S = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004, 0.006, 0.00
 _NO_DELAY_CHANGES_S = (0.0,)
 _OUTPUT_DELAYS_S = (0.0005, 0.0025, 0.0045)
 """Grid of delays, s: changes of their sum, and output delays."""
+_ONE_GRID_POINT = (0.0,), (0.0025,)
+"""The same, if only one other pair of delays is tried."""
 _MAX_DELAY_CHANGE_S = 0.0015
 """Range, s, of the linearisation along the delays around a grid point."""
 _ROWS_PER_JOINT = 1500
@@ -87,7 +89,8 @@ class CandidateScreening:
         self.screening_rows = context.samples.take_rows(self.rows)
         self._has_memory = any(one.law.has_memory for one in context.model.effects)
         shifts = _NO_DELAY_CHANGES_S if self._has_memory else _TOTAL_DELAY_CHANGES_S
-        self._grid = [context.model, *_delay_grid(context.model, shifts)]
+        grid = (shifts, _OUTPUT_DELAYS_S) if context.devices.screening_grid else _ONE_GRID_POINT
+        self._grid = [context.model, *_delay_grid(context.model, *grid)]
         self._term_points: dict[bool, DelayGridPoint] = {}
 
     def screen_laws(self, candidates: Iterable[EffectLaw]) -> list[ScreenedCandidate]:
@@ -179,7 +182,13 @@ class CandidateScreening:
         reduction = np.maximum(self.baseline_sse - error, 0.0) * allowed_joints(law, self.joints)
         ratio = 1.0 - reduction / np.maximum(self.baseline_sse, 1e-300)
         gain = -np.log(np.maximum(ratio, _MIN_ERROR_RATIO))
-        score = float(np.sum(np.maximum(gain - PENALTY_PER_PARAMETER * complexity(law), 0.0)))
+        score = float(
+            np.sum(
+                np.maximum(
+                    gain - PENALTY_PER_PARAMETER * complexity(law, self.context.devices.memory_cost), 0.0
+                )
+            )
+        )
         return ScreenedCandidate(model, score)
 
     def _start_values(self, law: EffectLaw) -> Array | None:
@@ -193,11 +202,11 @@ class CandidateScreening:
         return np.array(rows) if rows else None
 
 
-def _delay_grid(model: Model, shifts: Sequence[float]) -> Iterator[Model]:
+def _delay_grid(model: Model, shifts: Sequence[float], outputs: Sequence[float]) -> Iterator[Model]:
     """The model at the grid points within the bounds of the delays."""
     total = model.delays.sum(axis=0)
     for shift in shifts:
-        for output in _OUTPUT_DELAYS_S:
+        for output in outputs:
             delays = np.stack([total + shift - output, np.full_like(total, output)])
             if (delays > -1e-9).all() and (delays <= MAX_DELAYS_S[:, None] + 1e-9).all():
                 yield model.with_delays(delays)

@@ -47,7 +47,7 @@ class Search:
             evaluator: Data that models are fitted to and compared on.
             on_progress: Receives a short text before each step.
         """
-        self.evaluator, self._on_progress = evaluator, on_progress
+        self.evaluator, self._devices, self._on_progress = evaluator, evaluator.devices, on_progress
         self.rejected: dict[str, tuple[float, str]] = {}
         self._tested_count = 1
         self._rivals: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
@@ -88,7 +88,8 @@ class Search:
         least = min(one.criterion for one in models)
         margin = EQUIVALENCE_MARGIN * len(self.evaluator.noise)
         equivalent = [one for one in models if one.criterion < least + margin]
-        return self.prune(min(equivalent, key=_term_count)), laws
+        key = _term_count if self._devices.laws_before_terms else _criterion
+        return self.prune(min(equivalent, key=key)), laws
 
     def residual_correlates(self, fitted: FittedModel) -> tuple[str, ...]:
         """Return the signals that the residual correlates with most.
@@ -148,6 +149,8 @@ class Search:
 
     def _replace_by_special_case(self, fitted: FittedModel, index: int) -> FittedModel:
         """Replace a law by its special case (Stribeck by Coulomb friction), unless rows need it."""
+        if not self._devices.special_cases:
+            return fitted
         effect = fitted.model.effects[index]
         special_case = effect.law.special_case(dict(zip(effect.law.names, effect.values, strict=True)))
         if special_case is None:
@@ -219,7 +222,7 @@ class Search:
     def _rejection_reason(self, before: FittedModel, after: FittedModel) -> str:
         """Reason why an added effect is rejected; empty if it is accepted."""
         grown = len(after.model.effects) > len(before.model.effects)
-        if grown and duplicates_effect(after.last_effect, before.model.effects):
+        if grown and self._devices.no_repeats and duplicates_effect(after.last_effect, before.model.effects):
             return "the same joints already have a law that is its special or its general case"
         if grown and not after.last_effect.is_excited(after.model.signals):
             return "the joints moved too little to distinguish it from other laws"
@@ -248,7 +251,7 @@ class Search:
         """Models with gains, or delays, for each kind of joint and for each joint."""
         model, joints = before.model, before.model.samples.joints
         found = []
-        for groups in joint_groupings(joints):
+        for groups in joint_groupings(joints) if self._devices.gains_of_each_joint else ():
             finer = len(np.unique(groups))
             if finer > len(np.unique(model.gain_groups)):
                 found.append(attrs.evolve(model, gain_groups=groups))
@@ -266,7 +269,7 @@ class Search:
         Returns:
             The model with the necessary effects.
         """
-        while len(fitted.model.effects) > max(kept, 1):
+        while self._devices.elimination and len(fitted.model.effects) > max(kept, 1):
             model = fitted.model
             removable = range(len(model.effects) - kept)
             reduced = min(
@@ -322,6 +325,11 @@ class Search:
 def _term_count(fitted: FittedModel) -> tuple[int, float]:
     """Number of regressors of named signals, then the criterion: laws are easier to interpret."""
     return sum(isinstance(effect.law, SignalTerm) for effect in fitted.model.effects), fitted.criterion
+
+
+def _criterion(fitted: FittedModel) -> tuple[int, float]:
+    """The criterion alone, as a key."""
+    return 0, fitted.criterion
 
 
 def duplicates_effect(effect: AppliedEffect, others: Iterable[AppliedEffect]) -> bool:
