@@ -13,10 +13,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from quadvel_sysid.logs.checks import check_log
+from quadvel_sysid.logs.check_log import check_log
+from quadvel_sysid.logs.checks.response import MAX_LAG_S, Response, measure_response
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
-from quadvel_sysid.logs.response import MAX_LAG_S, Response, measure_response
 from tests.identification.hidden.cases import GROUP_OF, make_case
 
 SEED, INDICES = 77, (900, 901)

@@ -13,7 +13,7 @@ import attrs
 import numpy as np
 import typer
 
-from quadvel_sysid.logs.checks import check_log
+from quadvel_sysid.logs.check_log import check_log
 from quadvel_sysid.logs.log import Log
 
 Fields = dict[str, Any]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
-from quadvel_sysid.logs.checks import CheckedLog, check_log
+from quadvel_sysid.logs.check_log import CheckedLog, check_log
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
 

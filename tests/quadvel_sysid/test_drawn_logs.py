@@ -9,7 +9,7 @@ import attrs
 import numpy as np
 import pytest
 
-from quadvel_sysid.logs.checks import CheckedLog, check_log
+from quadvel_sysid.logs.check_log import CheckedLog, check_log
 from quadvel_sysid.logs.findings import Finding
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -12,7 +12,7 @@ from quadvel_sysid.data.dataset import Dataset
 from quadvel_sysid.data.plain_model import fit_eam
 from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.identify import identify
-from quadvel_sysid.logs.checks import check_logs
+from quadvel_sysid.logs.check_log import check_logs
 from quadvel_sysid.logs.excerpts import cut_excerpts
 from quadvel_sysid.options import IdentifyOptions
 

@@ -19,9 +19,10 @@ def _rows() -> list[list[str]]:
 
 
 def _name(path: Path) -> str:
-    """A module as the page writes it, or `logs/` for all of that folder."""
+    """A module as the page writes it, or a room in `logs/` for all of that folder."""
     inside = path.relative_to(PACKAGE).with_suffix("").as_posix()
-    return "logs/" if inside.startswith("logs/") else inside
+    room = re.match(r"logs/\w+/", inside)
+    return room[0] if room else inside
 
 
 def _imported(path: Path) -> set[str]:

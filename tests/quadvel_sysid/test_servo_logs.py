@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 import yaml
 
-from quadvel_sysid.logs.checks import CheckedLog, check_log, markdown_table
-from quadvel_sysid.logs.columns import ColumnMap
+from quadvel_sysid.logs.check_log import CheckedLog, check_log
+from quadvel_sysid.logs.checks.table import markdown_table
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
+from quadvel_sysid.logs.readers.columns import ColumnMap
 
 sys.path.insert(0, str(Path(__file__).parent))
 from servo_logs import KP, recorded

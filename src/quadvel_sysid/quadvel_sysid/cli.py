@@ -21,11 +21,11 @@ from typing_extensions import override
 
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .logs.checks import CheckedLog, check_logs
-from .logs.columns import ColumnMap
+from .logs.check_log import CheckedLog, check_logs
 from .logs.log import Log
 from .logs.read_log import read_log
-from .logs.recordings import Topics
+from .logs.readers.columns import ColumnMap
+from .logs.readers.recordings import Topics
 from .memory import keep_freed_arrays, return_large_arrays
 from .options import IdentifyOptions
 from .statistics.baselines import FILTER_SPAN_S

@@ -23,7 +23,7 @@ from .data.preparation import MIN_BLOCK_S, Preprocessed, preprocess
 from .data.signals import Samples
 from .data.split import DataSplit
 from .export.replay import Replay, find_load
-from .logs.checks import check_logs
+from .logs.check_log import check_logs
 from .logs.log import Log
 from .model.delays import longest_equivalent_delay, quantised_delays
 from .model.fit import fit

@@ -7,7 +7,7 @@ from itertools import chain
 
 import attrs
 
-from ..logs.checks import CheckedLog
+from ..logs.check_log import CheckedLog
 from ..logs.excerpts import cut_excerpts
 from ..logs.findings import Finding
 from ..logs.log import Log

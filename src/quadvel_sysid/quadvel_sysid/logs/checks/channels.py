@@ -10,8 +10,8 @@ import numpy as np
 from quadvel_description.arrays import Bools, Floats, Indices
 from quadvel_description.robot import JOINT_NAMES, LOWER, UPPER
 
-from .findings import Finding, format_names
-from .log import Log
+from ..findings import Finding, format_names
+from ..log import Log
 
 MAX_ROWS = 20_000
 """Rows that a check reads at most; they are spread evenly over the log to bound its memory."""

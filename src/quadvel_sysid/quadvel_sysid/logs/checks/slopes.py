@@ -19,7 +19,7 @@ from scipy.signal import savgol_coeffs, savgol_filter
 
 from quadvel_description.arrays import Floats
 
-from .log import GAP_FACTOR
+from ..log import GAP_FACTOR
 
 WINDOW_ROWS = (5, 7, 9, 13, 17, 21, 25, 33, 45, 65, 91)
 """Candidate widths of the filter, rows."""

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from ..log import LogError
 from .formats import LazyArray, import_reader, select_arrays
-from .log import LogError
 from .names import JOINT_NAMES_FIELD
 from .raw import MAX_VALUES, ColumnChooser, RawArrays
 

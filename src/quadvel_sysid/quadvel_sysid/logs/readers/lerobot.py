@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from ..log import LogError
 from . import parquet
-from .log import LogError
 from .raw import MAX_VALUES, ColumnChooser, RawArrays
 
 EPISODE_GAP_S = 1.0

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import scipy.io
 
+from ..log import LogError
 from . import hdf5
 from .formats import LazyArray, select_arrays
-from .log import LogError
 from .raw import MAX_VALUES, ColumnChooser, RawArrays, check_size
 
 MAX_UNPACKED_BYTES = 8 * MAX_VALUES

@@ -27,9 +27,9 @@ import numpy as np
 from quadvel_description.arrays import Floats
 from quadvel_description.bounded_yaml import read_yaml
 
+from ..findings import format_names
+from ..log import LogError
 from . import files
-from .findings import format_names
-from .log import LogError
 from .names import ALL_JOINTS, FIELDS, JOINT_NAMES_FIELD, resolve_columns
 from .raw import RawArrays
 from .units import si_factor

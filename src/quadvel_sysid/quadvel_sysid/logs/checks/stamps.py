@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .findings import Finding
-from .log import GAP_FACTOR, Log
+from ..findings import Finding
+from ..log import GAP_FACTOR, Log
 
 COMMAND_GAP_S = 0.1
 """s without a command that make a gap in a regular stream of commands."""

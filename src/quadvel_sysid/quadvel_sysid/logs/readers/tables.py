@@ -11,8 +11,8 @@ import numpy as np
 from quadvel_description.arrays import Bools, Floats
 from quadvel_description.robot import JOINT_NAMES
 
+from ..log import Log, LogError, joint_name
 from .columns import ColumnMap, read_fields
-from .log import Log, LogError, joint_name
 from .raw import check_size
 
 STATE_FIELDS = ("q", "dq", "tau", "temperature")

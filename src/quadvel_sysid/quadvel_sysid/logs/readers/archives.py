@@ -12,7 +12,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.lib import format as npy
 
-from .log import LogError
+from ..log import LogError
 from .names import JOINT_NAMES_FIELD
 from .raw import MAX_LINE_CHARS, ColumnChooser, RawArrays, as_numbers, check_size, check_type
 

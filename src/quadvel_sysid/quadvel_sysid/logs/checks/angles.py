@@ -14,6 +14,8 @@ import numpy as np
 from quadvel_description.arrays import Bools, Floats
 from quadvel_description.robot import JOINT_NAMES
 
+from ..findings import Finding, Kind, format_names
+from ..log import Log
 from .channels import (
     DEGREE_RAD,
     MOVING_SPAN_RAD,
@@ -23,8 +25,6 @@ from .channels import (
     sample_rows,
     slope_at_rows,
 )
-from .findings import Finding, Kind, format_names
-from .log import Log
 from .response import measure_response
 from .slopes import encoder_step, smooth_motion
 from .torque import lacks_sign

@@ -14,9 +14,9 @@ import numpy as np
 
 from quadvel_description.arrays import Array
 
+from ..findings import Finding
+from ..log import Log
 from .channels import sample_rows
-from .findings import Finding
-from .log import Log
 
 MIN_SEPARATION = 0.3
 """Share (root mean square) of a trace outside the span of the others, below which the pair is

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ..log import LogError
 from .formats import import_reader
-from .log import LogError
 from .raw import ColumnChooser, RawArrays, as_numbers, check_size, check_type
 
 BATCH_ROWS = 10_000

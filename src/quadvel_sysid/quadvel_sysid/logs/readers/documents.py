@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .log import LogError
+from ..log import LogError
 from .names import JOINT_NAMES_FIELD
 from .raw import ColumnChooser, RawArrays, check_size, open_bytes
 

@@ -11,8 +11,8 @@ import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from ..log import LogError
 from . import archives, csv_table, documents, formats, hdf5, lerobot, matlab, parquet
-from .log import LogError
 from .raw import ColumnChooser, RawArrays
 
 

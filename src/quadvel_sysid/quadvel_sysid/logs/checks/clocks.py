@@ -21,8 +21,8 @@ from scipy import fft
 
 from quadvel_description.arrays import Array, Indices
 
-from .findings import Finding
-from .log import Log
+from ..findings import Finding
+from ..log import Log
 from .response import (
     EXPLAINED_ERROR_SHARE,
     MAX_LAG_S,

@@ -23,8 +23,8 @@ import numpy as np
 
 from quadvel_description.arrays import Floats
 
+from ..log import LogError
 from . import units
-from .log import LogError
 from .names import TIME_FIELDS
 from .raw import MAX_LINE_CHARS, MAX_TEXT_CHARS, MAX_VALUES, ColumnChooser, RawArrays, field_dtype, open_bytes
 

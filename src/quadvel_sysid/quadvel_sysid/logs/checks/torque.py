@@ -9,9 +9,9 @@ import numpy as np
 
 from quadvel_description.arrays import Bools, Floats, Indices
 
+from ..findings import Finding, format_names
+from ..log import Log
 from .channels import TURN_RAD, joints_where, sample_rows
-from .findings import Finding, format_names
-from .log import Log
 from .response import EXPLAINED_ERROR_SHARE, TIME_ROUNDING_S, motion_regressors
 
 LAGS_S = (0.0, 0.005, 0.01, 0.02, 0.04)

@@ -16,9 +16,9 @@ from scipy.optimize import linear_sum_assignment
 
 from quadvel_description.arrays import Bools, Floats, Indices
 
+from ..findings import Finding, format_names
+from ..log import Log
 from .channels import DEGREE_RAD, MOVING_SPAN_RAD, TURN_RAD, joints_where
-from .findings import Finding, format_names
-from .log import Log
 
 MAX_ROWS = 4000
 """Rows of a log that are used, spread over its length."""

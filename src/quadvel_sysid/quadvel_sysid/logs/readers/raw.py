@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 from numpy.typing import DTypeLike
 
-from .log import LogError
+from ..log import LogError
 from .names import JOINT_NAMES_FIELD, TIME_FIELDS
 
 MAX_DOUBLE_VALUES = 16_000_000

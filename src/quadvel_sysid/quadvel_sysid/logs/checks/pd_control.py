@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from quadvel_description.arrays import Bools, Floats, Indices
 
-from .findings import Finding, format_names
-from .log import Log
+from ..findings import Finding, format_names
+from ..log import Log
 from .response import motion_regressors
 
 BIN_S = 0.02

@@ -11,7 +11,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from .log import LogError
+from ..log import LogError
 from .raw import ColumnChooser, RawArrays, as_numbers, check_size, check_type
 
 MAX_GROUPS = 1000

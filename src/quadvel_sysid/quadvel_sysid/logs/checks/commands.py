@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from quadvel_description.arrays import Array
 
+from ..findings import Finding, format_names
+from ..log import Log
 from .channels import MOVING_SPAN_RAD, joints_where, sample_rows
-from .findings import Finding, format_names
-from .log import Log
 from .response import motion_regressors
 
 MIN_SWING_RAD = 0.5

@@ -16,7 +16,7 @@ from quadvel_description.arrays import Floats
 from quadvel_recordings.joint_log import Series, common_joints, read_joint_log, require_commands
 from quadvel_recordings.reading import RecordingError
 
-from .log import Log, LogError, joint_name
+from ..log import Log, LogError, joint_name
 from .raw import check_size, storage_dtype
 from .tables import drop_repeated_times
 
