@@ -19,9 +19,6 @@ from quadvel_description.arrays import Array, Bools
 
 from ..data.signals import Samples, Signals
 
-_MEMORY_COST = 0.5
-"""Further cost, in parameters, of an effect with memory or one that resembles a delay."""
-
 InitialGuess = Mapping[str, Any]
 """Guess of every parameter that is not linear: a number, or one per joint (J,)."""
 
@@ -144,11 +141,6 @@ class EffectCandidate:
         return (self.name,)
 
     @property
-    def complexity(self) -> float:
-        """Cost in the criterion: equivalent number of parameters per joint."""
-        return len(self.parameters) + (_MEMORY_COST if self.shifts or self.has_memory else 0.0)
-
-    @property
     def penalty(self) -> Array | None:
         """Matrix of the quadratic penalty on the parameters in a fit, (P, P); None without one."""
         return None
@@ -160,6 +152,17 @@ class EffectCandidate:
         How far the parameters move between forms widens their intervals.
         """
         return ()
+
+    def complexity(self, memory_cost: float) -> float:
+        """Return the cost in the criterion.
+
+        Args:
+            memory_cost: Further parameters that an effect with memory, or one like a delay, counts as.
+
+        Returns:
+            Equivalent number of parameters per joint.
+        """
+        return len(self.parameters) + (memory_cost if self.shifts or self.has_memory else 0.0)
 
     @classmethod
     def forms(cls, effect: type[EffectModel], context: FormContext) -> Sequence[EffectCandidate]:
