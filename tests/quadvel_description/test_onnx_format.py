@@ -88,7 +88,7 @@ def test_broken_files_are_refused_or_written_as_onnx_reads_them() -> None:
     content = np.frombuffer(SHIPPED_MODEL.read_bytes(), np.uint8)
     keys = np.flatnonzero(content < 128)[:20_000]  # also lengths and names
     accepted = 0
-    for i in range(300):
+    for i in range(120):
         broken = content.copy()
         broken[rng.choice(keys, 3)] = rng.integers(0, 256, 3)
         try:
@@ -98,4 +98,4 @@ def test_broken_files_are_refused_or_written_as_onnx_reads_them() -> None:
         accepted += 1
         assert serialise(parse(found)) == found
         assert onnx.load_from_string(found).ByteSize() == len(found)
-    assert 50 < accepted < 250
+    assert 20 < accepted < 100
