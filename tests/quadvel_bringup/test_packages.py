@@ -19,6 +19,7 @@ MESSAGES = "quadvel_msgs"
 ROSDEP = {
     "attrs": "python3-attr",
     "evdev": "python3-evdev",
+    "jinja2": "python3-jinja2",
     "lz4": "python3-lz4",
     "matplotlib": "python3-matplotlib",
     "numba": "python3-numba",
@@ -38,7 +39,7 @@ PIP = {
     **dict.fromkeys(
         ("matplotlib", "numba", "numpy", "onnxscript", "rich", "rosbags", "scipy", "tensorboard"), ""
     ),
-    **dict.fromkeys(("h5py", "lz4", "msgspec", "pyarrow"), ""),
+    **dict.fromkeys(("h5py", "jinja2", "lz4", "msgspec", "pyarrow"), ""),
     **dict.fromkeys(
         ("attrs", "evdev", "threadpoolctl", "torch", "trimesh", "typer", "viser", "websockets"), ""
     ),
@@ -49,8 +50,8 @@ PIP = {
     "yaml": "pyyaml",
 }
 """Distributions that bring modules; of the module's name unless given"""
-BESIDE = {"setuptools", "quadvel_training"}
-"""Of every setup.py; and what `quadvel bench` measures where it is installed, which no package needs"""
+BESIDE = {"setuptools"}
+"""Of every setup.py"""
 OPTIONAL = {"quadvel_eval", "quadvel_follow", "quadvel_lab", "quadvel_sim", "quadvel_sysid"}
 """What quadvel_bringup names as texts: its commands and nodes refuse to start where it is not installed"""
 HEAVY = {"matplotlib", "mujoco", "numba", "onnx", "scipy", "torch"}

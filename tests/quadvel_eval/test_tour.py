@@ -18,7 +18,8 @@ from quadvel_eval.following.tour import Outcome, TourSample, TourSetup, summaris
 from quadvel_eval.following.tour_cli import run_tour
 from quadvel_eval.following.tour_report import tour_figure
 from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, State
-from quadvel_sim.world import Box, Trees, Wall, World
+from quadvel_sim.world import World
+from quadvel_sim.world_parts import Box, Trees, Wall
 
 CONFIG = FollowConfig(length=0.6, width=0.4)
 STANDING = World(

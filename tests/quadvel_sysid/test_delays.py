@@ -10,9 +10,9 @@ from quadvel_sysid.data.plain_model import fit_eam
 from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log
-from quadvel_sysid.model.torque_model.delays import longest_equivalent_delay, quantised_delays, running_delays
-from quadvel_sysid.model.torque_model.fit import fit, fit_delay_profile, squared_error
-from quadvel_sysid.model.torque_model.torque_model import Model
+from quadvel_sysid.model.delays import longest_equivalent_delay, quantised_delays, running_delays
+from quadvel_sysid.model.fit import fit, fit_delay_profile, squared_error
+from quadvel_sysid.model.torque_model import Model
 
 JOINTS = NAMES[:2]
 ONE = np.zeros(2, dtype=np.intp)

@@ -9,12 +9,12 @@ import attrs
 from quadvel_description.network_file import read_network
 from quadvel_description.onnx_format import message, serialise
 from quadvel_description.recurrent_network import METADATA_KEY
-from quadvel_policy.observation import COMMAND_AXES, CommandLimits
+from quadvel_policy.observation import COMMAND_AXES, VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_recordings.output import replacing
 
 
-def limit_commands(policy: Path, limits: CommandLimits) -> None:
+def limit_commands(policy: Path, limits: VelocityCommandLimits) -> None:
     """Rewrite the command limits in a policy file's metadata; everything else stays.
 
     Args:

@@ -238,11 +238,13 @@ def run(
 ) -> None:
     """Run one node in this process; the help is RUN_HELP."""
     from . import nodes
+    from .preflight import check_arguments
 
     arguments = [*context.args]
     if actuator is not None:
         file = json.dumps(str(actuator.resolve()))
         arguments = [*(arguments or ["--ros-args"]), "-p", f"actuator_file:={file}"]
+    check_arguments(node, arguments)
     nodes.run(node, arguments)
 
 

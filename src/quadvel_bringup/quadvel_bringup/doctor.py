@@ -19,8 +19,6 @@ ROBOT_PACKAGES = ("numpy", "cyclonedds", "onnxruntime", "rosbags")
 """Packages that the nodes of a robot need."""
 REQUIRED_PACKAGES = {**dict.fromkeys(ROBOT_PACKAGES, "robot"), "mcap": "log", "mujoco": "sim", "scipy": "sim"}
 """Packages that the simulated robot needs, and the extra of quadvel-core that installs them."""
-FILE_KEYS = ("actuator", "policy")
-"""Keys of /diagnostics with the files of a node."""
 GL_BACKENDS = ("egl", "osmesa")
 GL_PACKAGES = "libegl1 libopengl0"
 
@@ -62,7 +60,7 @@ def _robot() -> Finding:
     """Check for a running robot and its actuator model."""
     try:
         quadvel_dds.install()
-        from .status import running_nodes
+        from .status import FILE_KEYS, running_nodes
         from .whereabouts import discovery_hint
     except ImportError as error:
         return Finding("robot", True, f"not checked: {error}")

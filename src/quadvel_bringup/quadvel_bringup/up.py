@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from .exclusivity import check_exclusive
+import quadvel_dds
+
+from .exclusivity import ensure_exclusive
 from .node_output import PrefixedOutput
 from .page_watch import PageWatch
 from .preflight import check_stack
@@ -49,6 +51,15 @@ def up(stack: Stack, view: bool = False) -> int:
             if code and not (name == VIEW and watch.page_ended):
                 say("quadvel", f"{name} did not stop cleanly: exit code {code}")
     return 1 if any(codes.values()) else 0
+
+
+def check_exclusive() -> None:
+    """Run `ensure_exclusive` with a temporary node."""
+    quadvel_dds.install()
+    from .session import Session
+
+    with Session("look_for_others") as session:
+        ensure_exclusive(session.node)
 
 
 def _positive(code: int) -> int:

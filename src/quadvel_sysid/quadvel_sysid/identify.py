@@ -37,9 +37,9 @@ from .report.identification import Identification
 from .report.outcome import Outcome, SelectedEffect, build_identification
 from .report.sanity_checks import contradictions
 from .search.fitted_model import FittedModel, ModelEvaluator
-from .search.library import SignalTerm
 from .search.lost_commands import reassign_losses
-from .search.selection import Search
+from .search.regressors import RegressorCandidate
+from .search.selection import Search, SearchRecord
 from .statistics.baselines import baseline_errors
 from .statistics.confidence import intervals
 from .statistics.criterion import compare_residuals
@@ -121,7 +121,8 @@ def identify_prepared(
     evaluator = ModelEvaluator(preprocessed.parts.select_rows(rows), noise, cores)
     plain = attrs.evolve(plain, samples=samples)
     search, before = Search(evaluator, report_step), evaluator.fit(plain)
-    best, best_laws = search.best(plain)
+    searched = search.best(plain)
+    best, best_effects = searched.best, searched.best_effects
 
     # 3. Refit to all rows, and choose between nested models by replays where there is a load.
     corrected = base or ActuatorParameters.default()
@@ -129,14 +130,16 @@ def identify_prepared(
     progress(0.88, "replays" if replayer else "intervals")
     models = [before, best]
     if replayer:
-        laws = best_laws if best_laws is best else search.prune(best_laws)
-        models = [before, laws, best, *search.nested_models(laws)]
+        effects = best_effects if best_effects is best else search.prune(best_effects)
+        models = [before, effects, best, *search.nested_models(effects)]
     refitted = {one: _refit_all_rows(one, preprocessed, noise) for one in dict.fromkeys(models)}
     chosen = replayer.choose(refitted) if replayer else best
 
     # 4. Intervals and report.
     progress(0.93, "intervals")
-    outcome = _outcome(chosen, refitted[before], refitted[chosen], search, preprocessed, data, corrected)
+    outcome = _outcome(
+        chosen, refitted[before], refitted[chosen], search, searched.record, preprocessed, data, corrected
+    )
     found = build_identification(outcome, [*data.findings, *notes])
     parts, samples = preprocessed.parts, preprocessed.samples
     logs = [one.log for one in samples.logs]
@@ -193,6 +196,7 @@ def _outcome(
     before: Model,
     model: Model,
     search: Search,
+    record: SearchRecord,
     preprocessed: Preprocessed,
     data: IdentificationData,
     base: ActuatorParameters,
@@ -205,13 +209,13 @@ def _outcome(
         for one in (before, model)
     )
     effects = tuple(
-        SelectedEffect(*_heldout_gain(model, k, parts), search.indistinguishable_effects(fitted, k))
+        SelectedEffect(*_heldout_gain(model, k, parts), search.indistinguishable_effects(fitted, k, record))
         for k in range(len(model.effects))
     )
-    has_terms = any(isinstance(one.law, SignalTerm) for one in model.effects)
-    correlates = () if fitted.is_white or has_terms else search.residual_correlates(fitted)
-    names = {one.law.name for one in model.effects}
-    rejected = tuple((name, *why) for name, why in search.rejected.items() if name not in names)
+    has_regressors = any(isinstance(one.candidate, RegressorCandidate) for one in model.effects)
+    correlates = () if fitted.is_white or has_regressors else search.residual_correlates(fitted)
+    names = {one.candidate.name for one in model.effects}
+    rejected = tuple((name, *why) for name, why in record.rejected.items() if name not in names)
     commanded = np.ones_like(model_all_rows.gains)
     commanded[1] = 0.0 if samples.undamped else 1.0
     return Outcome(
@@ -257,9 +261,9 @@ class _Replayer:
     def choose(self, models: Mapping[FittedModel, Model]) -> FittedModel:
         """Choose the model that replays the motion best.
 
-        A later model has to reduce the error of the speed clearly: laws against the plain model,
-        regressors against laws, and fewer laws against all. Regressors may fit encoder errors, or
-        predict torque only along the recorded motion. A law may describe how the log was written.
+        A later model has to reduce the error of the speed clearly: effects against the plain model,
+        regressors against effects, and fewer effects against all. Regressors may fit encoder errors, or
+        predict torque only along the recorded motion. An effect may describe how the log was written.
         None of these improves the replayed motion.
 
         Args:

@@ -283,7 +283,7 @@ def _candidates(report: Mapping[str, Any]) -> str:
 
 
 def _placement_text(effect: Mapping[str, Any], joints: Sequence[str]) -> str:
-    """Where an effect was added, and which laws are indistinguishable from it."""
+    """Where an effect was added, and which effects are indistinguishable from it."""
     where = (
         "all joints"
         if len(effect["joints"]) == len(joints)

@@ -11,8 +11,9 @@ import numpy as np
 from quadvel_description.arrays import Array, Indices
 
 from ..data.split import DataSplit
+from ..model.applied_effect import AppliedEffect
 from ..model.fit import fit, fit_delay_profile
-from ..model.torque_model import AppliedEffect, Model
+from ..model.torque_model import Model
 from ..parallel import parallel_map
 from ..statistics.criterion import (
     PENALTY_PER_PARAMETER,
@@ -23,7 +24,6 @@ from ..statistics.criterion import (
     normality_p_values,
     whiteness_p_values,
 )
-from .library import complexity
 
 _VARIANCE_FLOOR = 1e-12
 """Added to variances, N^2 m^2, for logs without noise."""
@@ -99,11 +99,11 @@ def parameter_count(model: Model) -> float:
         model: The model.
 
     Returns:
-        Number of parameters; values shared by joints count once, see `library.complexity`.
+        Number of parameters; values shared by joints count once, see `EffectCandidate.complexity`.
     """
     total = 2.0 * (len(np.unique(model.gain_groups)) + len(np.unique(model.delay_groups)) - 2)
     for effect in model.effects:
-        total += complexity(effect.law) * len(np.unique(effect.groups[effect.active]))
+        total += effect.candidate.complexity * len(np.unique(effect.groups[effect.active]))
     return total
 
 
@@ -174,11 +174,11 @@ class ModelEvaluator:
             `fitted` or the model with the effect on fewer joints.
         """
         effect = fitted.model.effects[index]
-        if effect.law.all_joints_together:
+        if effect.candidate.all_joints_together:
             return fitted
         without = FittedModel(fitted.model.without_effect(index), self)
         comparison = fitted.compare_with(without)
-        cost = PENALTY_PER_PARAMETER * complexity(effect.law)
+        cost = PENALTY_PER_PARAMETER * effect.candidate.complexity
         needed = (
             effect.active
             & (comparison.joint_p_values < SIGNIFICANCE_LEVEL)
