@@ -308,6 +308,15 @@ class Samples:
         """Names of the joints."""
         return self.sources.series[0].log.joints
 
+    @property
+    def reference_gains(self) -> tuple[float, float]:
+        """Gains that deviations are relative to: medians of kp (N m/rad) and kd (N m s/rad)."""
+        kp, kd = (
+            float(np.median(np.concatenate([one.gains[name].ravel() for one in self.sources.series])))
+            for name in ("kp", "kd")
+        )
+        return max(kp, 1e-6), max(kd, 1e-6)
+
     def drop_heldout(self, rows: Bools) -> Samples:
         """Drop the logs at the end that hold none of the given rows.
 

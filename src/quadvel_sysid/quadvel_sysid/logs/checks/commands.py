@@ -12,7 +12,7 @@ from quadvel_description.arrays import Array
 
 from ..findings import Finding, format_names
 from ..log import Log
-from .channels import MOVING_SPAN_RAD, joints_where, sample_rows
+from .channels import MOVING_SPAN_RAD, sample_rows
 from .response import motion_regressors
 
 MIN_SWING_RAD = 0.5
@@ -52,7 +52,7 @@ def constant_command(log: Log) -> Iterator[Finding | Log]:
     hit = np.array([bool(rests) and not _holds(log, j) for j, rests in enumerate(resting)])
     if not hit.any():
         return
-    joints = joints_where(log, hit)
+    joints = log.joints_where(hit)
     values = sorted({f"{value:.3g}" for value in np.median(log.q_des, axis=0)[hit]})
     where = "all joints" if hit.all() else format_names(joints)
     text = f"q_des: never changes ({format_names(values)} on {where}) though q moves, so nothing follows a position"
