@@ -15,13 +15,12 @@ import attrs
 import numpy as np
 
 from quadvel_actuator.parameters import ActuatorParameters
-from quadvel_description.arrays import Bools, Indices
+from quadvel_description.arrays import Bools
 
 from .data.dataset import Dataset, Progress, no_progress
 from .data.noise import noise_variance
 from .data.plain_model import DRIVE_WINDOWS_S
 from .data.preparation import MIN_BLOCK_S, Preprocessed, preprocess
-from .data.signals import Samples
 from .data.split import DataSplit
 from .export.replay import Load, Replay, find_load
 from .logs.check_log import check_logs
@@ -161,18 +160,12 @@ def _evaluator(prepared: Preprocessed, options: IdentifyOptions) -> tuple[ModelE
     delays = np.stack([eam.input_delay, eam.output_delay])
     plain = Model(prepared.samples, eam.window, eam.gains, one, delays, one)
     noise = noise_variance(prepared.samples, prepared.parts.fit_or_select, plain.residual())
-    samples, rows = _search_rows(prepared)
-    evaluator = ModelEvaluator(prepared.parts.select_rows(rows), noise, options.cores, options.devices)
-    return evaluator, attrs.evolve(plain, samples=samples)
-
-
-def _search_rows(prepared: Preprocessed) -> tuple[Samples, Indices]:
-    """The samples that the search uses, and their row numbers; without held-out logs."""
+    # The search uses fewer rows, and none of the held-out logs.
     samples = prepared.samples.drop_heldout(prepared.parts.fit_or_select)
     step = min(round(samples.tau.size / _SEARCH_VALUES), round(_MAX_SEARCH_STEP_S / samples.period))
-    if step > 1:
-        return samples.thinned(step)
-    return samples, np.arange(len(samples.t))
+    samples, rows = samples.thinned(max(step, 1))
+    evaluator = ModelEvaluator(prepared.parts.select_rows(rows), noise, options.cores, options.devices)
+    return evaluator, attrs.evolve(plain, samples=samples)
 
 
 def _step_counter(progress: Progress) -> Callable[[str], None]:

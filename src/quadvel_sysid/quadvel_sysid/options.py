@@ -5,6 +5,7 @@ Each field states its description, unit and bounds in its metadata.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import attrs
@@ -13,27 +14,17 @@ from attrs import validators
 from quadvel_actuator.parameters import ActuatorParameters
 
 
-def _number(default: Any, description: str, unit: str, low: float, high: float) -> Any:
-    """A field for a number within bounds."""
-    return attrs.field(
-        default=default,
-        validator=[validators.ge(low), validators.le(high)],
-        metadata={"description": description, "unit": unit, "bounds": (low, high)},
-    )
+def _option(default: Any, description: str, bounds: tuple[float, float] | None = None, unit: str = "") -> Any:
+    """A field; numbers are checked against the bounds here, pairs of numbers where they are used."""
+    is_number = isinstance(default, (int, float))
+    validator = [validators.ge(bounds[0]), validators.le(bounds[1])] if bounds and is_number else None
+    metadata = {"description": description, "unit": unit, "bounds": bounds}
+    return attrs.field(default=default, validator=validator, metadata=metadata)
 
 
-def _choice(default: Any, description: str, unit: str = "", bounds: tuple[Any, ...] = ()) -> Any:
-    """A field for anything but a bounded number; `bounds` are documented and checked where it is used."""
-    return attrs.field(default=default, metadata={"description": description, "unit": unit, "bounds": bounds})
-
-
-def _switch(description: str) -> Any:
-    """A field for a device that is on unless an ablation switches it off."""
-    return attrs.field(
-        default=True,
-        validator=validators.instance_of(bool),
-        metadata={"description": description, "unit": "", "bounds": (False, True)},
-    )
+def _device(description: str) -> Any:
+    """A field for a device, which is on unless an ablation switches it off."""
+    return _option(True, description, (False, True))
 
 
 @attrs.frozen
@@ -43,33 +34,31 @@ class Devices:
     The defaults are those of `quadvel identify`.
     """
 
-    even_clocks: bool = _switch("restore the even clock of jittering stamps")
-    averaged_encoders: bool = _switch("average encoder noise that the drive did not act on")
-    sharp_accelerations: bool = _switch("keep accelerations sharp where a command arrives")
-    instants_per_row: int = _number(
-        2, "instants of a row for effects that are integrated between the rows", "", 1, 8
+    even_clocks: bool = _device("restore the even clock of jittering stamps")
+    averaged_encoders: bool = _device("average encoder noise that the drive did not act on")
+    sharp_accelerations: bool = _device("keep accelerations sharp where a command arrives")
+    instants_per_row: int = _option(2, "instants of a row, for effects that act between rows", (1, 8))
+    cluster_motion_rad: float = _option(0.02, "motion of some joint that ends a cluster", (0.0, 1.0), "rad")
+    kurtosis_test: bool = _device("test the residual for kurtosis as well as for autocorrelation")
+    delay_starts: int = _option(3, "points of the grid of delays from which fits start", (1, 100))
+    far_delays: bool = _device("try delays up to 8 ms from the present ones")
+    longest_delays: bool = _device("choose the longest equivalent delays, and whole drive steps")
+    screening_grid: bool = _device("screen candidates on a grid of delays")
+    memory_cost: float = _option(
+        0.5, "further parameters of a law with memory or one like a delay", (0.0, 10.0)
     )
-    cluster_motion: float = _number(0.02, "motion of some joint that ends a cluster", "rad", 0.0, 1.0)
-    kurtosis_test: bool = _switch("test the residual for kurtosis as well as for autocorrelation")
-    delay_starts: int = _number(3, "points of the grid of delays from which fits start", "", 1, 100)
-    far_delays: bool = _switch("try delays up to 8 ms from the present ones")
-    longest_delays: bool = _switch("choose the longest equivalent delays, and whole drive steps")
-    screening_grid: bool = _switch("screen candidates on a grid of delays")
-    memory_cost: float = _number(
-        0.5, "further parameters that a law with memory, or one like a delay, counts as", "", 0.0, 10.0
-    )
-    lost_commands_at_random: bool = _switch("accept lost commands only if the command's age does not predict")
-    fitted_laws: int = _number(6, "laws that are fitted after a screening", "", 1, 100)
-    fitted_terms: int = _number(4, "terms that are fitted after a screening", "", 1, 100)
-    shared_trials: int = _number(3, "best candidates for which sharing across joints is tested", "", 0, 100)
-    second_starts: bool = _switch("fit laws that shift the torque from two starts")
-    terms_at_nearby_delays: bool = _switch("refit terms from nearby delays")
-    finer_terms: bool = _switch("refine the shapes of terms after their screening")
-    laws_before_terms: bool = _switch("prefer laws to terms that explain the log equally well")
-    special_cases: bool = _switch("replace a law by its special case where the rows do not need it")
-    no_repeats: bool = _switch("reject a law that is nested with one on the same joints")
-    elimination: bool = _switch("remove effects that became unnecessary")
-    gains_of_each_joint: bool = _switch("try gains and delays of each joint")
+    lost_commands_at_random: bool = _device("accept lost commands only if the command's age does not predict")
+    fitted_laws: int = _option(6, "laws that are fitted after a screening", (1, 100))
+    fitted_terms: int = _option(4, "terms that are fitted after a screening", (1, 100))
+    shared_trials: int = _option(3, "best candidates for which sharing across joints is tested", (0, 100))
+    second_starts: bool = _device("fit laws that shift the torque from two starts")
+    terms_at_nearby_delays: bool = _device("refit terms from nearby delays")
+    finer_terms: bool = _device("refine the shapes of terms after their screening")
+    laws_before_terms: bool = _device("prefer laws to terms that explain the log equally well")
+    special_cases: bool = _device("replace a law by its special case where the rows do not need it")
+    no_repeats: bool = _device("reject a law that is nested with one on the same joints")
+    elimination: bool = _device("remove effects that became unnecessary")
+    gains_of_each_joint: bool = _device("try gains and delays of each joint")
 
 
 DEVICES = Devices()
@@ -80,28 +69,19 @@ DEVICES = Devices()
 class IdentifyOptions:
     """What a user chooses about an identification."""
 
-    gains: tuple[float, float] | None = _choice(
+    gains: tuple[float, float] | None = _option(
         None,
         "commanded kp and kd of logs that hold none; None to fit them",
+        (0.0, math.inf),
         "N m/rad, N m s/rad",
-        (0.0, float("inf")),
     )
-    max_values: int = _number(
-        60_000,
-        "torque values to use over all logs and joints; longer logs are cut into excerpts",
-        "",
-        1000,
-        10**9,
+    max_values: int = _option(60_000, "torque values of all logs; longer logs are cut", (1000, 10**9))
+    base: ActuatorParameters | None = _option(
+        None, "model whose torque limits are kept; None for the default"
     )
-    base: ActuatorParameters | None = _choice(
-        None, "parameters whose torque limits the corrected model keeps; None for the defaults"
-    )
-    robot: str | None = _choice(
-        None,
-        "robot whose legs replay the commands: aliengo, go2, or an MJCF or URDF file; None for no replay",
-    )
-    cores: int = _number(1, "worker processes; the report does not depend on them", "", 1, 1024)
-    devices: Devices = _choice(DEVICES, "devices of the search; an ablation switches some off")
+    robot: str | None = _option(None, "legs that replay the commands: aliengo, go2, an MJCF or URDF file")
+    cores: int = _option(1, "worker processes; the report does not depend on them", (1, 1024))
+    devices: Devices = _option(DEVICES, "devices of the search; an ablation switches some off")
 
 
 DEFAULTS = IdentifyOptions()

@@ -79,7 +79,7 @@ def preprocess(
 
     def fit_logs(logs: Sequence[Log], steady: float = 0.0) -> Preprocessed:
         samples = Samples.of(logs, steady, devices)
-        parts = split_rows(samples, dataset, shortest, devices.cluster_motion)
+        parts = split_rows(samples, dataset, shortest, devices.cluster_motion_rad)
         return Preprocessed(samples, parts, fit_eam(samples, parts.fit, windows=windows))
 
     logs: Sequence[Log] = dataset.logs
@@ -101,7 +101,7 @@ def preprocess(
 
 
 def split_rows(
-    samples: Samples, dataset: Dataset, shortest: float, motion: float = DEVICES.cluster_motion
+    samples: Samples, dataset: Dataset, shortest: float, motion: float = DEVICES.cluster_motion_rad
 ) -> DataSplit:
     """Divide the rows into blocks that are fitted, used for selection, or held out.
 

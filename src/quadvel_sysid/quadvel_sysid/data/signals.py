@@ -339,8 +339,10 @@ class Samples:
             step: Spacing, rows.
 
         Returns:
-            The samples, and the indices of their rows.
+            The samples, and the indices of their rows; these samples if all rows are kept.
         """
+        if step == 1:
+            return self, np.arange(len(self.t))
         rows = np.arange(step - 1, len(self.t), step)
         t, period = self.t[rows], step * self.period
         start = np.diff(np.cumsum(self.start)[rows], prepend=-1) > 0

@@ -50,14 +50,7 @@ _TORQUE_LIMIT_MARGIN = 1.1
 
 _MAX_POINTS = 4000
 """Maximum number of points of a series in a figure."""
-_SIGNAL_UNITS = {
-    "q": "rad",
-    "q_des": "rad",
-    "dq": "rad/s",
-    "ddq": "rad/s^2",
-    "tau": "N m",
-    "t": "s",
-}
+_SIGNAL_UNITS = {"q": "rad", "q_des": "rad", "dq": "rad/s", "ddq": "rad/s^2", "tau": "N m", "t": "s"}
 
 
 @attrs.frozen(eq=False)

@@ -85,11 +85,12 @@ class Search:
             laws = self.prune(self.extend(laws, LAWS, bound=terms.criterion))
             models += [laws] if laws.is_white else [laws, self.extend(laws, TERMS, bound=terms.criterion)]
         # Among models with nearly equal criteria the one with the fewest regressors counts.
+        if not self._devices.laws_before_terms:
+            return self.prune(min(models, key=lambda one: one.criterion)), laws
         least = min(one.criterion for one in models)
         margin = EQUIVALENCE_MARGIN * len(self.evaluator.noise)
         equivalent = [one for one in models if one.criterion < least + margin]
-        key = _term_count if self._devices.laws_before_terms else _criterion
-        return self.prune(min(equivalent, key=key)), laws
+        return self.prune(min(equivalent, key=_term_count)), laws
 
     def residual_correlates(self, fitted: FittedModel) -> tuple[str, ...]:
         """Return the signals that the residual correlates with most.
@@ -325,11 +326,6 @@ class Search:
 def _term_count(fitted: FittedModel) -> tuple[int, float]:
     """Number of regressors of named signals, then the criterion: laws are easier to interpret."""
     return sum(isinstance(effect.law, SignalTerm) for effect in fitted.model.effects), fitted.criterion
-
-
-def _criterion(fitted: FittedModel) -> tuple[int, float]:
-    """The criterion alone, as a key."""
-    return 0, fitted.criterion
 
 
 def duplicates_effect(effect: AppliedEffect, others: Iterable[AppliedEffect]) -> bool:

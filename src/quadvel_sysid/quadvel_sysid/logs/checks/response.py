@@ -163,6 +163,19 @@ def motion_regressors(dq: Floats) -> Floats:
     return np.stack([dq, np.tanh(dq / FRICTION_SPEED_RAD_S), np.ones(len(dq))], 1)
 
 
+def least_squares_residual(signals: Floats, x: Floats) -> Floats:
+    """Compute the residual of a least-squares fit.
+
+    Args:
+        signals: (R, K) regressors.
+        x: (R,) values.
+
+    Returns:
+        (R,) residual.
+    """
+    return np.asarray(x - signals @ np.linalg.lstsq(signals, x, rcond=1e-9)[0])
+
+
 def _project_out(regressors: Floats, x: Floats) -> Floats:
     """Residual of `x` (R,) or (R, L) after a least-squares fit on `regressors` (R, K)."""
     basis = np.linalg.qr(regressors)[0]

@@ -12,7 +12,7 @@ from quadvel_description.arrays import Bools, Floats, Indices
 from ..findings import Finding, format_names
 from ..log import Log
 from .channels import TURN_RAD, sample_rows
-from .response import EXPLAINED_ERROR_SHARE, TIME_ROUNDING_S, motion_regressors
+from .response import EXPLAINED_ERROR_SHARE, TIME_ROUNDING_S, least_squares_residual, motion_regressors
 
 LAGS_S = (0.0, 0.005, 0.01, 0.02, 0.04)
 """s; lags from a command to its torque that are tried."""
@@ -192,7 +192,7 @@ def is_magnitude(values: Floats, signals: Floats) -> bool:
     Returns:
         True if the magnitude fits clearly better.
     """
-    signed = _squared_error(signals, values)
+    signed = float(np.sum(least_squares_residual(signals, values) ** 2))
     if signed < EXPLAINED_ERROR_SHARE * len(values) * np.var(values):
         return False
     signals = signals / (np.sqrt(np.mean(signals**2, axis=0)) + 1e-12)
@@ -207,8 +207,3 @@ def is_magnitude(values: Floats, signals: Floats) -> bool:
         total = signals @ np.linalg.lstsq(signals, signs * np.abs(values), rcond=1e-9)[0]
         least = min(least, float(np.sum((np.abs(values) - np.abs(total)) ** 2)))
     return least < MAGNITUDE_ERROR_RATIO * signed
-
-
-def _squared_error(signals: Floats, values: Floats) -> float:
-    """Sum of squared residuals of the least-squares fit of `values` on `signals`."""
-    return float(np.sum((values - signals @ np.linalg.lstsq(signals, values, rcond=1e-9)[0]) ** 2))
