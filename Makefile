@@ -81,15 +81,15 @@ $(PY):
 
 $(VENV)/.run: $(PY) $(LOCKED)
 	@echo "Installing quadvel and its dependencies into $(VENV) (a few minutes the first time) ..."
-	$(PY) $(INSTALL) '.[video,view]'
+	$(PY) $(INSTALL) '.[eval,view]'
 	@touch $@
 
 $(VENV)/.lint: $(VENV)/.run
-	$(PY) $(INSTALL) '.[video,view,lint]'
+	$(PY) $(INSTALL) '.[eval,view,lint]'
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.run
-	$(PY) $(INSTALL) '.[video,view,formats,test,train]'
+	$(PY) $(INSTALL) '.[eval,view,formats,test,train]'
 	@touch $@
 
 # The wheels are only for x86-64, and our interfaces are compiled: both are checked before the installation.
@@ -99,10 +99,10 @@ $(ROS_PY): $(PY) $(BUILD_INTERFACES)
 
 $(ROS_VENV)/.run: $(ROS_PY) $(LOCKED) $(INTERFACES)
 	@echo "Installing ROS 2's rclpy, quadvel and its dependencies into $(ROS_VENV) (a few minutes the first time) ..."
-	$(ROS_PY) $(INSTALL) '.[video,view,ros]'
+	$(ROS_PY) $(INSTALL) '.[eval,view,ros]'
 	$(ROS_PY) $(BUILD_INTERFACES)
 	@touch $@
 
 $(ROS_VENV)/.test: $(ROS_VENV)/.run
-	$(ROS_PY) $(INSTALL) '.[video,view,formats,ros,test]'
+	$(ROS_PY) $(INSTALL) '.[eval,view,formats,ros,test]'
 	@touch $@

@@ -1,8 +1,8 @@
-"""Ablation study of the effect search: its score without each device, on the same logs.
+"""Ablation study of the effect search: its score without each of its options, on the same logs.
 
     python -m tests.identification.ablation --logs 2 --seed 912 --jobs 2 --out out/ablation [--switches nesting,elimination]
 
-Each switch disables one device. An interrupted run continues where it stopped, as that of
+Each switch turns one option off. An interrupted run continues where it stopped, as that of
 `tests.identification.score`. The comparison is paired: it counts the logs whose verdict changes.
 """
 
@@ -20,7 +20,7 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
-from quadvel_sysid.options import Devices, IdentifyOptions
+from quadvel_sysid.options import IdentifyOptions, SearchOptions
 from tests.identification.hidden.cases import GROUP_OF
 from tests.identification.score import save_row, score_case
 
@@ -31,12 +31,12 @@ SWITCHES: dict[str, dict[str, Any]] = {
     BASELINE: {},
     "second starts": {"second_starts": False},
     "sharing per candidate": {"shared_trials": 0},
-    "terms at nearby delays": {"terms_at_nearby_delays": False},
-    "finer terms": {"finer_terms": False},
-    "half as many fits": {"fitted_laws": 3, "fitted_terms": 2},
+    "regressors at nearby delays": {"regressors_at_nearby_delays": False},
+    "finer regressors": {"finer_regressors": False},
+    "half as many fits": {"fitted_effects": 3, "fitted_regressors": 2},
     "three valleys of delays": {"delay_starts": 1},
     "far delays": {"far_delays": False},
-    "laws before terms": {"laws_before_terms": False},
+    "effects before regressors": {"effects_before_regressors": False},
     "nesting": {"special_cases": False},
     "no repeats": {"no_repeats": False},
     "elimination": {"elimination": False},
@@ -52,25 +52,25 @@ SWITCHES: dict[str, dict[str, Any]] = {
     "losses at random": {"lost_commands_at_random": False},
     "longest delays": {"longest_delays": False},
 }
-"""For each device the fields of `Devices` that disable it."""
+"""For each switch the fields of `SearchOptions` that it changes."""
 
 
-def devices_without(switches: str) -> Devices:
-    """Disable some devices of the identification.
+def options_without(switches: str) -> SearchOptions:
+    """Turn some options of the search off.
 
     Args:
         switches: Keys of `SWITCHES`, joined by `+`.
 
     Returns:
-        The remaining devices.
+        The options of the search.
     """
     disabled = [SWITCHES[switch] for switch in switches.split("+")]
-    return Devices(**{name: value for fields in disabled for name, value in fields.items()})
+    return SearchOptions(**{name: value for fields in disabled for name, value in fields.items()})
 
 
 def _work(switches: str, kind: str, index: int, seed: int, path: Path) -> None:
-    """Score one log without some devices, into its file."""
-    options = IdentifyOptions(devices=devices_without(switches))
+    """Score one log without some options, into its file."""
+    options = IdentifyOptions(search=options_without(switches))
     save_row(score_case(kind, index, seed, options), path)
 
 
@@ -78,7 +78,7 @@ def table(rows: dict[str, dict[str, dict[str, Any]]]) -> str:
     """Build the table of the study.
 
     Args:
-        rows: Rows of the score by switch and log; `BASELINE` has every device.
+        rows: Rows of the score by switch and log; `BASELINE` has every option on.
 
     Returns:
         Markdown: changed verdicts, right verdicts with and without, and ratios of error and time.
@@ -114,7 +114,7 @@ def main(
     jobs: int = 2,
     out: Annotated[Path, typer.Option(help="Folder of the verdicts.")] = Path("out/ablation"),
 ) -> None:
-    """Score the identification without each of its devices in turn."""
+    """Score the identification without each of its options in turn."""
     asked = [BASELINE, *(switches.split(",") if switches else [one for one in SWITCHES if one != BASELINE])]
     unknown = {one for switch in asked for one in switch.split("+")} - SWITCHES.keys()
     if unknown:

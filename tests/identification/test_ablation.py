@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import attrs
 
-from quadvel_sysid.options import DEVICES, Devices
-from tests.identification.ablation import BASELINE, SWITCHES, devices_without, table
+from quadvel_sysid.options import SEARCH_DEFAULTS, SearchOptions
+from tests.identification.ablation import BASELINE, SWITCHES, options_without, table
 
 
-def test_every_device_has_a_switch_that_disables_it() -> None:
-    assert devices_without(BASELINE) == DEVICES
-    assert all(devices_without(switch) != DEVICES for switch in SWITCHES if switch != BASELINE)
+def test_every_option_has_a_switch_that_turns_it_off() -> None:
+    assert options_without(BASELINE) == SEARCH_DEFAULTS
+    assert all(options_without(switch) != SEARCH_DEFAULTS for switch in SWITCHES if switch != BASELINE)
     assert {name for fields in SWITCHES.values() for name in fields} == {
-        field.name for field in attrs.fields(Devices)
+        field.name for field in attrs.fields(SearchOptions)
     }
 
 
-def test_joined_switches_disable_all_devices() -> None:
-    devices = devices_without("half as many fits+far delays")
-    assert (devices.fitted_laws, devices.far_delays) == (3, False)
+def test_joined_switches_turn_all_their_options_off() -> None:
+    options = options_without("half as many fits+far delays")
+    assert (options.fitted_effects, options.far_delays) == (3, False)
 
 
 def test_the_table_counts_changed_verdicts() -> None:

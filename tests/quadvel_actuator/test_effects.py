@@ -6,19 +6,14 @@ import pytest
 from simulated_joints import NAMES, parameters
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
-from quadvel_actuator.effects import MemoryLaw, Stage, registry
-from quadvel_actuator.effects.base import evaluate_distinct
+from quadvel_actuator.effects import MemoryEffect, Stage, registry
+from quadvel_actuator.effects.numerics import evaluate_distinct
 from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.logs.log import Log
-from quadvel_sysid.model.torque_model import (
-    DELAY_STEP_S,
-    AppliedEffect,
-    Model,
-    Unknowns,
-    jacobian,
-    pack,
-    with_slots,
-)
+from quadvel_sysid.model.applied_effect import AppliedEffect
+from quadvel_sysid.model.jacobian import DELAY_STEP_S, Unknowns, jacobian, pack, with_slots
+from quadvel_sysid.model.torque_model import Model
+from quadvel_sysid.search.effect_candidates.registry import candidate_classes
 
 JOINTS = NAMES[:3]
 TRUTH = {
@@ -61,7 +56,7 @@ def _motion(steps=800, dt=0.001):
 
 
 @pytest.mark.parametrize("name", sorted(set(registry()) - UNLIKE))
-def test_a_law_gives_the_same_torque_step_by_step_and_over_a_series(name):
+def test_an_effect_gives_the_same_torque_step_by_step_and_over_a_series(name):
     t, q, dq, q_des = _motion()
     joints = (*JOINTS, NAMES[3])
     effect = Effect(name, JOINTS, TRUTH[name])
@@ -77,43 +72,43 @@ def test_a_law_gives_the_same_torque_step_by_step_and_over_a_series(name):
     settings = {k: v for k, v in TRUTH[name].items() if isinstance(v, (str, list)) or k == "full"}
     if name == "cross_coupling":
         settings["source"] = [*settings["source"], settings["source"][0]]
-    law = registry()[name].from_settings(settings, joints)
-    values = np.array([np.full(4, TRUTH[name][parameter]) for parameter in law.names])
+    form = registry()[name].from_settings(settings, joints)
+    values = np.array([np.full(4, TRUTH[name][parameter]) for parameter in form.names])
     active = np.array([True, True, True, False])
     zero = np.zeros(4, dtype=int)
     series = Model(
         Samples.of([log]), 0.001, np.ones((2, 4)), zero, np.zeros((2, 4)), zero,
-        (AppliedEffect(law, active, values, np.arange(4)),),
+        (AppliedEffect(_candidate(form), active, values, np.arange(4)),),
     ).predict()  # fmt: skip
     skip, tolerance = (5, 0.15) if name in LATE else (0, 2e-3 if name == "thermal_drift" else 1e-8)
     np.testing.assert_allclose(steps[skip:], series[skip:], atol=tolerance)
     plain = 30.0 * (q_des - q) - 0.5 * dq
-    assert np.abs(steps[:, :3] - plain[:, :3]).max() > 0.05, "the law does something"
+    assert np.abs(steps[:, :3] - plain[:, :3]).max() > 0.05, "the effect does something"
     np.testing.assert_allclose(steps[:, 3], plain[:, 3], atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["slew_limit", "velocity_filter", "backlash", "hysteresis"])
-def test_a_law_of_another_package_needs_its_step_alone_to_be_run_over_a_series(name):
+def test_an_effect_of_another_package_needs_its_step_alone_to_be_run_over_a_series(name):
     """For any stretches and guesses; `series` of an effect is only a faster way."""
     t, q, dq, q_des = _motion(200)
     samples = Samples.of([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
     s = samples.at(0.0, 0.0, 0.0)
     s = attrs.evolve(s, start=s.start | (np.arange(200) % 70 == 0)[:, None])
     settings = {"on": "error"} if name == "backlash" else {}
-    law = registry()[name].from_settings(settings, NAMES[:4])
+    form = registry()[name].from_settings(settings, NAMES[:4])
     guesses = np.array([0.7, 1.0, 1.6])[:, None, None]
-    p = {parameter: TRUTH[name][parameter] * guesses + np.zeros(4) for parameter in law.names}
-    x = (s.q_des - s.q, s.dq_des - s.dq) if law.stage == Stage.ERRORS else s.stiffness_torque
-    own, simple = law.series(x, s, p), MemoryLaw.series(law, x, s, p)
+    p = {parameter: TRUTH[name][parameter] * guesses + np.zeros(4) for parameter in form.names}
+    x = (s.q_des - s.q, s.dq_des - s.dq) if form.stage == Stage.ERRORS else s.stiffness_torque
+    own, simple = form.series(x, s, p), MemoryEffect.series(form, x, s, p)
     for one, other in zip(own, simple, strict=True) if isinstance(x, tuple) else [(own, simple)]:
         np.testing.assert_allclose(*np.broadcast_arrays(one, other), atol=1e-12)
 
 
 def test_a_coupling_to_a_torque_does_not_carry_the_noise_of_its_measurement_over():
     t, q, dq, q_des = _motion(300)
-    law = registry()["cross_coupling"].from_settings({"source": [f"{NAMES[1]}/tau"] * 4}, NAMES[:4])
+    form = registry()["cross_coupling"].from_settings({"source": [f"{NAMES[1]}/tau"] * 4}, NAMES[:4])
     every, zero = np.ones(4, dtype=bool), np.zeros(4, dtype=int)
-    coupled = AppliedEffect(law, every, np.full((1, 4), 0.2), np.arange(4))
+    coupled = AppliedEffect(_candidate(form), every, np.full((1, 4), 0.2), np.arange(4))
     torques = []
     for noise in (0.0, 1.0):
         tau = noise * np.random.default_rng(0).standard_normal(q.shape)
@@ -126,45 +121,49 @@ def test_a_coupling_to_a_torque_does_not_carry_the_noise_of_its_measurement_over
 def test_a_coupling_has_an_offset_where_it_is_of_an_angle_and_nowhere_else():
     """Otherwise it would explain a constant offset that no neighbour causes."""
     sources = [f"{NAMES[1]}/q", f"{NAMES[0]}/dq", f"{NAMES[0]}/tau", f"{NAMES[0]}/dq"]
-    law = registry()["cross_coupling"].from_settings({"source": sources}, NAMES[:4])
+    form = registry()["cross_coupling"].from_settings({"source": sources}, NAMES[:4])
     t, q, dq, q_des = _motion(300)
     s = Samples.of([Log("still", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)]).at(0, 0, 0)
-    torque = law.torque(s.stiffness_torque, s, {"a": np.zeros(4), "offset": np.ones(4)})
+    torque = form.torque(s.stiffness_torque, s, {"a": np.zeros(4), "offset": np.ones(4)})
     np.testing.assert_array_equal(torque, np.tile([1.0, 0.0, 0.0, 0.0], (len(q), 1)))
     values = np.ones((2, 4))
-    np.testing.assert_array_equal(_on(law, values, 0, 1).values, [np.ones(4), [1, 0, 0, 0]])
+    np.testing.assert_array_equal(_on(form, values, 0, 1).values, [np.ones(4), [1, 0, 0, 0]])
 
 
 def test_a_coupling_that_is_of_no_angle_on_its_joints_is_the_same_in_a_file():
     """The file names the sources of these joints only."""
     sources = [f"{NAMES[1]}/q", f"{NAMES[0]}/dq", f"{NAMES[0]}/tau", f"{NAMES[0]}/dq"]
-    law = registry()["cross_coupling"].from_settings({"source": sources}, NAMES[:4])
-    kept = _on(law, np.ones((2, 4)), 1, 2)
+    form = registry()["cross_coupling"].from_settings({"source": sources}, NAMES[:4])
+    kept = _on(form, np.ones((2, 4)), 1, 2)
     filed = registry()["cross_coupling"].from_settings({"source": sources[1:3]}, NAMES[:4])
-    assert kept.law.names == filed.names
-    assert _on(kept.law, kept.values, 0, 1, 2).law.names == law.names
+    assert kept.candidate.names == filed.names
+    assert _on(kept.candidate.effect, kept.values, 0, 1, 2).candidate.names == form.names
 
 
-def _on(law, values, *joints):
+def _candidate(form):
+    return candidate_classes()[form.name](form)
+
+
+def _on(form, values, *joints):
     """The effect that remains on these joints after a fit."""
     active = np.isin(np.arange(4), joints)
-    return AppliedEffect(law, active, values, np.arange(4)).canonical()
+    return AppliedEffect(_candidate(form), active, values, np.arange(4)).canonical()
 
 
 @pytest.mark.parametrize("at", ["drive", "joint"])
 @pytest.mark.parametrize("source", ["q", "tau"])
-@pytest.mark.parametrize("name", [name for name, law in registry().items() if law.stage == Stage.ADDED])
+@pytest.mark.parametrize("name", [name for name, effect in registry().items() if effect.stage == Stage.ADDED])
 def test_slopes_of_a_fit_are_those_of_the_torque(name, source, at):
     """Whether or not the effect depends on the drive's torque or on delays."""
     t, q, dq, q_des = _motion(300)
     forms = {"cross_coupling": {"source": [f"{NAMES[1]}/{source}"] * 4}, "armature": {"of": "ddq_sharp"}}
-    law = registry()[name].from_settings({"at": at, **forms.get(name, {})}, NAMES[:4])
-    values = np.array([np.full(4, TRUTH[name].get(one, 0.0)) for one in law.names])
+    form = registry()[name].from_settings({"at": at, **forms.get(name, {})}, NAMES[:4])
+    values = np.array([np.full(4, TRUTH[name].get(one, 0.0)) for one in form.names])
     every, zero = np.ones(4, dtype=bool), np.zeros(4, dtype=int)
     samples = Samples.of([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
     model = Model(
         samples, 0.0, np.ones((2, 4)), zero, np.repeat([[0.004], [0.002]], 4, axis=1), zero,
-        (AppliedEffect(law, every, values, np.arange(4)),),
+        (AppliedEffect(_candidate(form), every, values, np.arange(4)),),
     )  # fmt: skip
     unknowns = Unknowns.of(model)
     torque, slopes = jacobian(model, unknowns)
@@ -206,15 +205,14 @@ def test_a_torque_added_at_the_joint_does_not_wait_for_the_output_delay(name):
 
     plain = 30.0 * (q_des - q) - 0.5 * dq
     late = np.concatenate([np.repeat(plain[:1], 4, axis=0), plain[:-4]])
-    law = registry()[name](at="joint")
+    form = registry()[name](at="joint")
     samples = Samples.of([Log("steps", JOINTS, t, q, dq, t, q_des, np.ones(q.shape, bool), tau=steps)])
-    p = {parameter: np.full(3, TRUTH[name][parameter]) for parameter in law.names}
+    p = {parameter: np.full(3, TRUTH[name][parameter]) for parameter in form.names}
     now = samples.at(0.0, 0.0, 0.0)
-    added = law.series(late, now, p) if name == "hysteresis" else law.torque(late, now, p)
-    np.testing.assert_allclose(steps[5:], (late + added)[5:], atol=1e-9)
+    np.testing.assert_allclose(steps[5:], (late + form.series(late, now, p))[5:], atol=1e-9)
 
 
-def test_every_law_has_a_truth_to_be_tested_with():
+def test_every_effect_has_a_truth_to_be_tested_with():
     assert set(TRUTH) == set(registry())
 
 

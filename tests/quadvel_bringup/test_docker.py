@@ -11,7 +11,7 @@ from pathlib import Path
 import attrs
 import pytest
 
-from .test_packages import PACKAGES, declared, requirements
+from .test_packages import HEAVY, OPTIONAL, PACKAGES, declared, needed, requirements
 
 ROOT = Path(__file__).parents[2]
 DOCKER = ROOT / "docker"
@@ -93,14 +93,35 @@ def test_packages_of_ros_that_ours_declare_are_in_the_image() -> None:
     assert of_ros <= apt_packages("install-runtime")
 
 
-def test_pip_brings_all_that_running_needs() -> None:
-    script = (DOCKER / "install-deps").read_text()
-    extras = re.findall(r'--editable "\.\[\$\{1:-(.+?)\}\]"', script)
-    assert len(extras) == 1
-    assert {"evdev", "foxglove-sdk", "imageio-ffmpeg", "viser", "websockets"} <= requirements(
-        *extras[0].split(",")
-    )
-    assert "docker/install-runtime" in script.splitlines()
+def build(name: str) -> tuple[set[str], set[str]]:
+    """Distributions that pip installs into an image, and packages of quadvel that colcon builds."""
+    lines = stages()[f"build-{name}"].all("RUN")
+    extras = [words[1:] for words in map(str.split, lines) if words[0] == "docker/install-deps"][-1]
+    default = re.search(r'--editable "\.\[\$\{1:-(.+?)\}\]"', (DOCKER / "install-deps").read_text())
+    assert default is not None
+    up_to = re.search(r"--packages-up-to (.+)", lines[-1])
+    packages = set.union(*map(needed, up_to[1].split())) if up_to else set(PACKAGES)
+    return requirements(*(extras[0] if extras else default[1]).split(",")), packages
+
+
+def test_the_image_of_the_simulator_has_everything() -> None:
+    distributions, packages = build("sim")
+    assert {"evdev", "foxglove-sdk", "imageio-ffmpeg", "mujoco", "viser", "websockets"} <= distributions
+    assert packages == set(PACKAGES)
+    assert "docker/install-runtime" in (DOCKER / "install-deps").read_text().splitlines()
+
+
+def test_the_image_of_the_robot_has_no_laboratory() -> None:
+    distributions, packages = build("robot")
+    assert packages & OPTIONAL == {"quadvel_follow"}
+    assert distributions & HEAVY == {"scipy"}  # of quadvel_follow
+    assert {"evdev", "mcap", "onnxruntime", "viser", "websockets"} <= distributions
+
+
+@pytest.mark.parametrize("name", ["sim", "robot"])
+def test_an_image_takes_what_was_built_for_it(name: str) -> None:
+    from_stages = re.findall(r"--from=(\S+)", " ".join(stages()[name].all("COPY")))
+    assert set(from_stages) == {f"build-{name}"}
 
 
 def test_files_that_the_images_take_are_there_and_scripts_can_be_read() -> None:

@@ -21,7 +21,6 @@ MESSAGES = "quadvel_msgs"
 ROSDEP = {
     "attrs": "python3-attr",
     "evdev": "python3-evdev",
-    "google": "python3-protobuf",
     "jinja2": "python3-jinja2",
     "lz4": "python3-lz4",
     "matplotlib": "python3-matplotlib",
@@ -48,14 +47,16 @@ PIP = {
     ),
     "backports": "backports.zstd",
     "foxglove": "foxglove-sdk",
-    "google": "protobuf",
     "imageio_ffmpeg": "imageio-ffmpeg",
     "typing_extensions": "typing-extensions",
     "yaml": "pyyaml",
 }
 """Distributions that bring modules; of the module's name unless given"""
-BESIDE = {"setuptools", "quadvel_training"}
-"""Of every setup.py; and what `quadvel bench` measures where it is installed, which no package needs"""
+BESIDE = {"setuptools"}
+"""Of every setup.py"""
+OPTIONAL = {"quadvel_eval", "quadvel_follow", "quadvel_lab", "quadvel_sim", "quadvel_sysid"}
+"""What quadvel_bringup names as texts: its commands and nodes refuse to start where it is not installed"""
+HEAVY = {"matplotlib", "mujoco", "numba", "onnx", "scipy", "torch"}
 OF_TOOLS = ("test", "ros", "lint")
 """Extras whose packages no source imports"""
 BY_TORCH = {"onnxscript", "tensorboard"}
@@ -101,7 +102,40 @@ def used(package: str) -> set[str]:
         definitions = [*(SRC / package).glob("msg/*.msg"), *(SRC / package).glob("srv/*.srv")]
         lines = "\n".join(file.read_text() for file in definitions)
         return set(re.findall(r"^([a-z0-9_]+)/\w+", lines, re.MULTILINE))
-    return imported(SRC / package) - set(sys.stdlib_module_names) - BESIDE - {package}
+    found = imported(SRC / package) - set(sys.stdlib_module_names) - BESIDE - {package}
+    return found - OPTIONAL if package == "quadvel_bringup" else found
+
+
+def statements(package: str) -> set[str]:
+    """The first names of all modules that import statements of a package name."""
+    names = set()
+    for node in trees(SRC / package):
+        if isinstance(node, ast.Import):
+            names |= {one.name for one in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names.add(node.module)
+    return {name.partition(".")[0] for name in names}
+
+
+def test_bringup_imports_no_laboratory() -> None:
+    assert statements("quadvel_bringup") & (OPTIONAL | HEAVY) == set()
+
+
+def test_what_the_laboratory_is_made_of_declares_itself_to_the_whole() -> None:
+    """colcon build --packages-up-to quadvel_lab builds all; up to quadvel_bringup, what a robot needs."""
+    assert needed("quadvel_lab") == set(PACKAGES)
+    assert needed("quadvel_bringup") & OPTIONAL == set()
+
+
+def needed(package: str) -> set[str]:
+    """The packages of quadvel that a package needs, with those that they need, and itself."""
+    found, waiting = set(), [package]
+    while waiting:
+        one = waiting.pop()
+        if one not in found:
+            found.add(one)
+            waiting += declared(one) & set(PACKAGES)
+    return found
 
 
 def declared(package: str) -> set[str]:
@@ -117,12 +151,17 @@ def test_package_xml_declares_what_the_sources_import_and_nothing_else(package: 
 
 
 def requirements(*extras: str) -> set[str]:
-    """Names of the distributions that pyproject.toml asks for, with these extras."""
+    """Names of the distributions that pyproject.toml asks for, with these extras and those that they include."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    listed = [
-        *project["dependencies"],
-        *(one for extra in extras for one in project["optional-dependencies"][extra]),
-    ]
+    listed, waiting, seen = list(project["dependencies"]), list(extras), set()
+    while waiting:
+        extra = waiting.pop()
+        for one in () if extra in seen else project["optional-dependencies"][extra]:
+            if included := re.fullmatch(rf"{project['name']}\[(.+)\]", one):
+                waiting += included[1].split(",")
+            else:
+                listed.append(one)
+        seen.add(extra)
     return {re.split(r"[\[<>=;]", one)[0] for one in listed}
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from quadvel_bringup import up
-from quadvel_bringup.preflight import NODE_CHECKS, check_stack
+from quadvel_bringup.preflight import NODE_CHECKS, check_arguments, check_stack
 from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
 
 
@@ -62,13 +62,22 @@ def test_a_wrong_name_or_file_is_refused_before_anything_starts(
     [
         (
             "sim_node:\n  ros__parameters: {payloat: 1.0}",
-            "sim_node: found the parameter payloat, expected one of",
+            r"sim_node: found the parameter payloat, did you mean payload\?$",
         ),
         ("sim_node:\n  ros__parameters: {payload: 1}", "sim_node: payload is 1, expected a float"),
         ("sim_node:\n  ros__parameters: {payload: 99.0}", "sim_node: .*payload.*99"),
         (
             "simnode:\n  ros__parameters: {payload: 1.0}",
-            "found a section for '/simnode', expected one of sim_node,",
+            r"p\.yaml: found a section for '/simnode', did you mean sim_node\?$",
+        ),
+        ("moon:\n  ros__parameters: {payload: 1.0}", "section for '/moon', expected one of sim_node, board,"),
+        (
+            "view:\n  ros__parameters: {prot: 8080}",  # of a node that is not started
+            r"p\.yaml: view: found the parameter prot, did you mean port\?$",
+        ),
+        (
+            "/**:\n  ros__parameters: {max_tlit: 0.9}",
+            r"p\.yaml: /\*\*: found the parameter max_tlit, did you mean max_tilt\?$",
         ),
         ("driver:\n  ros__parameters: {calibration: nowhere.yaml}", r"driver: .*nowhere\.yaml"),
         ("sim_node: [", "p.yaml' is not valid YAML"),
@@ -99,3 +108,45 @@ def test_a_file_that_is_no_text_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "p.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ValueError, match=r"p\.yaml' is not text"):
         check_stack(Stack(parameters=tmp_path / "p.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ["-p", "controllers:max_tilt:=0.9"],
+            r"found a section for '/\*\*/controllers', did you mean controller\?",
+        ),
+        (["-p", "max_tlit:=0.9"], r"found the parameter max_tlit, did you mean max_tilt\?"),
+        (["-p", "view:prot:=1"], r"view: found the parameter prot, did you mean port\?"),
+        (
+            ["-r", "__node:=legs", "-p", "legs:max_tlit:=0.9"],
+            r"controller: .* max_tlit, did you mean max_tilt\?",
+        ),
+    ],
+)
+def test_a_misspelt_name_in_the_arguments_of_a_node_is_refused_with_the_nearest_one(
+    words: list[str], sentence: str
+) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        check_arguments("controller", ["--ros-args", *words])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["-p", "max_tilt:=0.9", "-p", "use_sim_time:=true"],
+        ["-r", "__node:=legs", "-r", "__ns:=/robot", "-p", "legs:max_tilt:=0.9"],
+        ["-p", "view:port:=1"],
+        ["--an-argument-of-ros-only"],  # left to rclpy
+    ],
+)
+def test_arguments_of_a_node_with_known_names_are_accepted(words: list[str]) -> None:
+    check_arguments("controller", ["--ros-args", *words])
+
+
+def test_a_parameter_file_for_several_namespaces_is_understood_by_one_node(tmp_path: Path) -> None:
+    text = "/one/controller:\n  ros__parameters: {max_tilt: 0.9}\n/two/view:\n  ros__parameters: {port: 1}"
+    file = written(tmp_path / "p.yaml", text)
+    check_arguments("controller", ["--ros-args", "-r", "__ns:=/one", "--params-file", str(file)])

@@ -17,6 +17,7 @@ from quadvel_bringup.stack import PARAMETERS, Stack
 from quadvel_dds.arguments import parse
 from quadvel_lab.follow_demo import FOLLOW_TOPICS
 from quadvel_lab.recorded_run import RECORDED_TOPICS
+from quadvel_nodes.parameters import parameter_fields
 
 SRC = Path(__file__).parents[2] / "src"
 
@@ -58,7 +59,7 @@ def declared_parameters() -> dict[str, dict[str, Any]]:
     return {
         name: {
             field.name: list(field.default) if isinstance(field.default, tuple) else field.default
-            for field in attrs.fields(kind)
+            for field in parameter_fields(kind).values()
         }
         for name, kind in classes.items()
     }

@@ -16,7 +16,7 @@ import pytest
 from rich.console import Console
 
 from quadvel_bringup import up
-from quadvel_bringup.exclusivity import RobotAlreadyRunningError, check_exclusive
+from quadvel_bringup.exclusivity import RobotAlreadyRunningError
 from quadvel_bringup.stack import Stack
 from quadvel_lab.scripted_walk import ScriptedWalk
 
@@ -136,7 +136,7 @@ def test_beside_another_simulator_it_does_not_start(
         until = time.monotonic() + 30.0
         while time.monotonic() < until:
             with suppress(RobotAlreadyRunningError):
-                check_exclusive()
+                up.check_exclusive()
                 continue
             break
         named = f"low_state: already published on ROS domain .* by sim_node \\(pid {other.pid}\\)"

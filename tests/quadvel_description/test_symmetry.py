@@ -48,7 +48,7 @@ def _observation(data: mujoco.MjData, command: np.ndarray, action: np.ndarray) -
 
 
 @pytest.mark.parametrize(
-    "mirror", [symmetry.OBSERVATION, symmetry.JOINTS, symmetry.FEET, *symmetry.PARTS.values()]
+    "mirror", [symmetry.OBSERVATION, symmetry.JOINTS, symmetry.FEET, *symmetry.MIRRORS.values()]
 )
 def test_mirroring_twice_is_the_identity(mirror):
     x = np.random.default_rng(0).normal(size=(5, len(mirror.index)))

@@ -6,8 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
+from importlib import metadata
+from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import SimpleNamespace
 
+import attrs
 import pytest
 
 from quadvel_description.network_file import NetworkFileError
@@ -61,7 +66,8 @@ def test_ctrl_c_twice_ends_an_evaluation_and_leaves_the_old_results(tmp_path: Pa
 def test_bench_fails_before_it_measures_if_it_cannot_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bench, "PARTS", {"simulator": lambda: pytest.fail("it measured")})
+    measure = bench.Benchmark(lambda: pytest.fail("it measured"), ())
+    monkeypatch.setattr(bench, "PARTS", {"simulator": measure})
     for out in (tmp_path, Path("/proc/bench.json")):
         with pytest.raises(OSError, match=r"is a folder, expected a file|can't be written"):
             bench_command(out)
@@ -70,14 +76,34 @@ def test_bench_fails_before_it_measures_if_it_cannot_write(
 def test_bench_writes_figures_and_reports_skipped_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    parts = dict.fromkeys(bench.PARTS, lambda: {"skipped": "not now"})
-    parts["simulator"] = lambda: {"realtime_factor": 17.25, "with_sensors_realtime_factor": 9.0}
+    parts = {
+        name: attrs.evolve(part, measure=lambda: {"skipped": "not now"}) for name, part in bench.PARTS.items()
+    }
+    figures = {"realtime_factor": 17.25, "with_sensors_realtime_factor": 9.0}
+    parts["simulator"] = attrs.evolve(parts["simulator"], measure=lambda: figures)
     monkeypatch.setattr(bench, "PARTS", parts)
+    added = [
+        EntryPoint(f"added{k}", f"{module}:PART", bench.GROUP)
+        for k, module in enumerate(("tiny", "not_here"))
+    ]
+    monkeypatch.setattr(metadata, "entry_points", lambda group: added if group == bench.GROUP else [])
+    tiny = SimpleNamespace(PART=bench.Benchmark(lambda: {"speed": 3.25}, (("speed", "tiny speed", "1"),)))
+    monkeypatch.setitem(sys.modules, "tiny", tiny)  # type: ignore[arg-type]
     bench_command(tmp_path / "out" / "bench.json")
     written = json.loads((tmp_path / "out" / "bench.json").read_text())
     assert written["simulator"]["realtime_factor"] == 17.25
     assert written["policy"] == {"skipped": "not now"}
+    assert written["added0"] == {"speed": 3.25}
+    assert "not_here" in written["added1"]["skipped"]
     assert written["machine"]["cores"] >= 1
     said = capsys.readouterr().out
     assert "17.25" in said
     assert "not now" in said
+    assert "tiny speed" in said
+
+
+def test_the_benchmarks_of_the_training_can_be_loaded() -> None:
+    pytest.importorskip("torch")
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    for name, value in project["entry-points"][bench.GROUP].items():
+        assert isinstance(EntryPoint(name, value, bench.GROUP).load(), bench.Benchmark)

@@ -17,7 +17,9 @@ from quadvel_eval.faults.cases import CASES, Case
 from quadvel_eval.faults.injection import COMPONENTS, KINDS, REASONS_UNSUPPORTED, make_injection
 from quadvel_eval.faults.report import markdown, write_campaign
 from quadvel_eval.faults.stack import Stack
-from quadvel_policy.guards import GUARDS, DriveDoesNotAnswer, StateFrozen
+from quadvel_policy.guards import GUARDS
+from quadvel_policy.guards.legs import DriveDoesNotAnswer
+from quadvel_policy.guards.states import StateFrozen
 
 
 def case(name: str) -> Case:

@@ -10,10 +10,10 @@ from quadvel_eval.paper.section import Study
 from quadvel_eval.paper.sustained import Sustained
 from quadvel_eval.paper.tracking import Tracking, left_right_difference
 from quadvel_eval.segments import Segment
-from quadvel_policy.observation import CommandLimits
+from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_policy.policy_file import SHIPPED_POLICY
 
-LIMITS = CommandLimits((-1.0, -0.5, -1.0), (2.0, 0.5, 1.0))
+LIMITS = VelocityCommandLimits((-1.0, -0.5, -1.0), (2.0, 0.5, 1.0))
 
 
 def answer(

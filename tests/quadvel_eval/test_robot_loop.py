@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from quadvel_description.state import JointCommand
 from quadvel_eval.robot_loop import RobotLoop, Sample, TrueVelocity, make_estimator
 from quadvel_policy.supervisor import Supervisor
+from quadvel_policy.tick_input import TickInput
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 
 
@@ -66,9 +68,9 @@ def test_the_supervisor_walks_on_the_estimate_of_the_state_before(standing_polic
     used: list[object] = []
 
     class Spy(Supervisor):
-        def tick(self, now, state, velocity, command):  # type: ignore[no-untyped-def]
-            used.append(velocity)
-            return super().tick(now, state, velocity, command)
+        def tick(self, inputs: TickInput) -> JointCommand:
+            used.append(inputs.velocity)
+            return super().tick(inputs)
 
     loop = RobotLoop(simulator, Spy(standing_policy), TrueVelocity(simulator))
     truths = [loop.tick().truth.linear_velocity for _ in range(5)]

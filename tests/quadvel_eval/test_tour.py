@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from quadvel_eval.following import tour
 from quadvel_eval.following.obstacles import PERSON_RADIUS_M, Clearances, outline_points
 from quadvel_eval.following.tour import Outcome, TourSample, TourSetup, summarise_tour
 from quadvel_eval.following.tour_cli import run_tour
 from quadvel_eval.following.tour_report import tour_figure
 from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, State
-from quadvel_sim.world import Box, Trees, Wall, World
+from quadvel_sim.world import World
+from quadvel_sim.world_parts import Box, Trees, Wall
 
 CONFIG = FollowConfig(length=0.6, width=0.4)
 STANDING = World(
@@ -86,6 +88,17 @@ def test_some_metres_down_the_corridor_behind_a_person(tmp_path: Path) -> None:
     assert found["least_clearance"] > 0.3
     assert found["error_xy"] < 0.15
     assert (tmp_path / "tour.png").stat().st_size > 10_000
+
+
+def test_a_robot_that_no_longer_moves_on_ends_the_tour(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tour, "STUCK_TIME_S", 1.0)
+    setup = TourSetup(world="corridor", path_length=5.0, distance=12.0)  # the person never gets so far away
+    assert not run_tour(setup, tmp_path, Console(file=StringIO(), width=120))
+    found = json.loads((tmp_path / "tour.json").read_text())
+    assert found["stuck"]
+    assert not found["fell"]
 
 
 def test_the_picture_counts_minutes_from_its_first_moment(tmp_path: Path) -> None:

@@ -10,9 +10,12 @@ import numpy as np
 
 from quadvel_description.robot import LIE_Q
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
+from quadvel_nodes.parameters import make_record
+from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.guard import Guard
 from quadvel_policy.guards import GUARDS
-from quadvel_policy.supervisor import Supervisor, SupervisorConfig
+from quadvel_policy.supervisor import Supervisor
+from quadvel_policy.tick_input import TickInput
 
 PERIOD = 0.005
 STILL = (0.0, 0.0, 0.0, 1.0)
@@ -26,13 +29,14 @@ class Rig:
         self, policy: Any, guards: Iterable[type[Guard]] = GUARDS, backup: Any = None, **config: Any
     ) -> None:
         self.policy = policy
-        self.supervisor = Supervisor(policy, SupervisorConfig(**config), backup, guards)
+        self.supervisor = Supervisor(policy, make_record(SupervisorConfig, config), backup, guards)
         zeros = np.zeros(12)
         upright, down = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 9.81])
         self.state = RobotState(
             100.0, 0, LIE_Q.copy(), zeros, zeros, upright, np.zeros(3), down, np.full(4, 60.0)
         )
         self.velocity: Any = np.zeros(3)
+        self.inputs: dict[str, Any] = {}  # further fields of TickInput
         self.asked = JointCommand.damping()
 
     @property
@@ -46,7 +50,7 @@ class Rig:
         time, tick = self.state.time + step, self.state.tick + round(1e3 * step)
         self.state = attrs.evolve(self.state, time=time, tick=tick)
         seen = attrs.evolve(self.state, **changes)
-        self.asked = self.supervisor.tick(time + age, seen, self.velocity, command)
+        self.asked = self.supervisor.tick(TickInput(time + age, seen, self.velocity, command, **self.inputs))
         if self.asked.kp.any():
             self.state.q = self.asked.q.copy()
         return self.asked

@@ -27,8 +27,9 @@ from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, Vel
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.messages import write_low_state
 from quadvel_nodes.node import StartError
+from quadvel_nodes.scheduling import Scheduling
 from quadvel_policy.control_loop import _value_if_fresh
-from quadvel_policy.controller import Controller, ControllerParameters
+from quadvel_policy.controller import Controller
 
 PERIOD = 0.005
 
@@ -447,9 +448,7 @@ def test_a_second_robot_on_the_same_topic_is_a_fault_and_refuses_to_be_stood_up(
 def test_in_real_time_a_driver_that_sends_as_best_it_can_is_heard(
     write_policy: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        ControllerParameters, "apply", lambda *_: None
-    )  # the tests' process keeps its priority
+    monkeypatch.setattr(Scheduling, "apply", lambda *_: None)  # the tests' process keeps its priority
     rclpy.init(args=["--ros-args", "-p", f"policy:={write_policy()}"])
     try:
         controller, driver = Controller(), rclpy.create_node("driver", use_global_arguments=False)

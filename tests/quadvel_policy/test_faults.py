@@ -18,9 +18,11 @@ from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy import command_limits
 from quadvel_policy.command_limits import LIMITS, JointCommandLimiter
 from quadvel_policy.faults import page, table
-from quadvel_policy.guard import Guard, Level, MotorStatus
-from quadvel_policy.guards import GUARDS, EncoderInconsistent, ideal_torque
+from quadvel_policy.guard import Guard, Level
+from quadvel_policy.guards import GUARDS
+from quadvel_policy.guards.legs import EncoderInconsistent, ideal_torque
 from quadvel_policy.supervisor import SUPERVISOR_FAULTS
+from quadvel_policy.tick_input import MotorStatus, TickInput
 
 Changes = dict[str, Any]
 """Changes of the state of one tick, its age, or the time since the previous one"""
@@ -107,18 +109,18 @@ def stuck_joint(rig: Rig, k: int) -> Changes:
 
 def stopped(rig: Rig, seconds: float) -> Changes:
     """The controller does not run for this long, while the robot continues."""
-    rig.supervisor.stopped = seconds
+    rig.inputs["stopped"] = seconds
     return {"step": seconds}
 
 
 def motors(rig: Rig, temperature: float = 40.0, dropped_out: int | None = None) -> Changes:
-    rig.supervisor.motors = MotorStatus(np.full(12, temperature), np.arange(12) == dropped_out)
+    rig.inputs["motors"] = MotorStatus(np.full(12, temperature), np.arange(12) == dropped_out)
     return {}
 
 
 def attribute(name: str, value: Any) -> Callable[[Rig, int], Changes]:
     def bring(rig: Rig, k: int) -> Changes:
-        setattr(rig.supervisor, name, value)
+        rig.inputs[name] = value
         return {}
 
     return bring
@@ -145,7 +147,7 @@ def right_velocity(rig: Rig) -> None:
 
 
 def cool(rig: Rig) -> None:
-    rig.supervisor.motors = None
+    rig.inputs.clear()
 
 
 CASES: dict[str, Case] = {
@@ -176,7 +178,7 @@ CASES: dict[str, Case] = {
         lambda rig, k: {"linear_acceleration": np.array([30.0, 0.0, 9.81])}, 0.2
     ),
     "motor_hot": Case(lambda rig, k: motors(rig, temperature=90.0), mend=cool),
-    "overruns": Case(attribute("overruns", 21), mend=lambda rig: setattr(rig.supervisor, "overruns", 0)),
+    "overruns": Case(attribute("overruns", 21), mend=cool),
     "no_velocity": Case(neither_velocity, 3 * PERIOD, right_velocity),
     "estimate_stale": Case(no_velocity, mend=right_velocity),
     "estimate_wrong": Case(wrong_velocity, 0.11, right_velocity),
@@ -231,7 +233,7 @@ def check_damping(rig: Rig, case: Case, name: str) -> None:
     rig.run(0.3, FORWARD)
     assert (rig.mode, rig.supervisor.reason) == ("fault", reason)
     assert rig.supervisor.request("stand_up") == (False, f"is in fault ({reason}), request passive first")
-    rig.supervisor.duplicate_publisher = rig.supervisor.motors = None
+    rig.inputs.clear()
     assert rig.supervisor.request("passive")[0]
     rig.policy.action = np.zeros(12, np.float32)
     rig.walk()
@@ -425,7 +427,7 @@ def check_limit(policy: Any, name: str) -> None:
         rig.policy.action = np.full(12, action * (-1) ** (k * (name == "torque_jumps")), np.float32)
         time, tick = rig.state.time + (k + 1) * PERIOD, rig.state.tick + 5 * (k + 1)
         rig.seen = attrs.evolve(rig.state, time=time, tick=tick, q=NOMINAL_Q, **changes)
-        command = rig.supervisor.tick(time, rig.seen, rig.velocity, FORWARD)
+        command = rig.supervisor.tick(TickInput(time, rig.seen, rig.velocity, FORWARD))
         torque = asked_torque(command, rig)
         power = np.maximum(torque * rig.seen.dq, 0.0).sum()
         assert np.abs(torque).max() <= TORQUE_LIMIT.max() + 1e-9

@@ -11,7 +11,9 @@ import pytest
 
 from quadvel_description import mjcf
 from quadvel_description.robot import KP, LIE_Q, NOMINAL_HEIGHT, NOMINAL_Q
-from quadvel_policy.supervisor import Supervisor, SupervisorConfig
+from quadvel_policy.config import SupervisorConfig
+from quadvel_policy.supervisor import Supervisor
+from quadvel_policy.tick_input import TickInput
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.terrain import Terrain
 
@@ -42,7 +44,7 @@ class Stand:
     def run(self, seconds: float, command: Any = STILL) -> None:
         for _ in range(round(seconds / 0.005)):
             state, velocity = self.simulator.state(), self.simulator.truth().linear_velocity
-            asked = self.supervisor.tick(self.simulator.time, state, velocity, command)
+            asked = self.supervisor.tick(TickInput(self.simulator.time, state, velocity, command))
             self.torques.append(asked.kp * (asked.q - state.q) + asked.kd * (asked.dq - state.dq))
             self.simulator.command(asked)
             self.simulator.step(5)

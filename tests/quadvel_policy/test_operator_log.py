@@ -9,7 +9,8 @@ import numpy as np
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_policy.operator_log import OperatorLog
-from quadvel_policy.supervisor import Supervisor, SupervisorConfig
+from quadvel_policy.supervisor import Supervisor
+from quadvel_policy.tick_input import TickInput
 
 STILL, FORWARD = (0.0, 0.0, 0.0, 1.0), (0.5, 0.0, 0.0, 0.0)
 
@@ -18,7 +19,7 @@ class Run:
     """A standing robot and the log of its supervisor."""
 
     def __init__(self, policy: Any) -> None:
-        self.supervisor = Supervisor(policy, SupervisorConfig())
+        self.supervisor = Supervisor(policy)
         self.announcements = OperatorLog(self.supervisor)
         self._ticks = 0
 
@@ -32,7 +33,7 @@ class Run:
             state = RobotState(
                 time, 5 * self._ticks, NOMINAL_Q, zeros, zeros, upright, zeros[:3], zeros[:3], zeros[:4]
             )
-            self.supervisor.tick(time, state, np.zeros(3), command)
+            self.supervisor.tick(TickInput(time, state, np.zeros(3), command))
             sentences += self.announcements.changes()
         return sentences
 

@@ -11,7 +11,7 @@ import onnx
 import pytest
 
 from quadvel_description.ahead import split_network
-from quadvel_description.network_file import NetworkFileError
+from quadvel_description.network_file import NetworkFileError, read_network
 from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 
@@ -66,9 +66,10 @@ def test_a_prepared_policy_acts_as_one_that_is_not(write_policy: WritePolicy, sh
 
 
 def test_most_of_the_shipped_policy_needs_no_observation() -> None:
-    parts = split_network(onnx.load(SHIPPED_POLICY), "obs")
+    parts = split_network(read_network(SHIPPED_POLICY), "obs")
     assert parts is not None
-    ahead, rest = (sum(np.prod(one.dims) for one in part.graph.initializer) for part in parts)
+    graphs = [part.one("graph") for part in parts]
+    ahead, rest = (sum(np.prod(one.all("dims")) for one in graph.all("initializer")) for graph in graphs)
     assert ahead > rest
 
 

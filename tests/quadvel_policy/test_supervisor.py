@@ -8,17 +8,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import attrs
 import numpy as np
 import pytest
 from rig import FORWARD, STILL, Rig, assert_damping
 
 from quadvel_description.robot import COMMAND_UPPER, LIE_Q, NOMINAL_Q, TORQUE_LIMIT, UPPER
 from quadvel_description.state import MODE_SERVO
+from quadvel_nodes.parameters import make_record, parameter_fields
 from quadvel_policy.control_loop import ControlConfig
-from quadvel_policy.guards import GUARDS, EncoderInconsistent
+from quadvel_policy.guards import GUARDS
+from quadvel_policy.guards.legs import EncoderInconsistent
 from quadvel_policy.observation import PolicyMetadata
-from quadvel_policy.supervisor import MODES, SupervisorConfig
+from quadvel_policy.transitions import MODES
 
 WITHOUT_ENCODERS = [guard for guard in GUARDS if guard is not EncoderInconsistent]
 
@@ -333,14 +334,14 @@ def test_an_action_that_is_not_finite_is_a_fault(rig: Rig) -> None:
 
 def test_while_somebody_finds_an_obstacle_nothing_moves(policy: Any) -> None:
     rig = Rig(policy, auto_stand=True)
-    rig.supervisor.duplicate_publisher = "low_state has 2 publishers"
+    rig.inputs["duplicate_publisher"] = "low_state has 2 publishers"
     rig.run(0.1)
     assert rig.mode == "passive"
     assert rig.supervisor.request("stand_up") == (False, "low_state has 2 publishers")
-    rig.supervisor.duplicate_publisher = None
+    rig.inputs["duplicate_publisher"] = None
     rig.run(2.5)
     assert rig.mode == "stance"
-    rig.supervisor.duplicate_publisher = "low_state has 2 publishers"
+    rig.inputs["duplicate_publisher"] = "low_state has 2 publishers"
     rig.tick()
     assert (rig.mode, rig.supervisor.reason) == ("fault", "low_state has 2 publishers")
 
@@ -409,8 +410,9 @@ def test_what_a_policy_asks_for_beyond_the_range_goes_as_torque(policy: Any) -> 
     np.testing.assert_array_less(rig.asked.tau, TORQUE_LIMIT + 1e-9)
 
 
-LIMITS = [name for name, value in attrs.asdict(SupervisorConfig()).items() if not isinstance(value, bool)]
-LIMITS += ["max_velocity_age", "command_timeout"]
+LIMITS = [
+    name for name, field in parameter_fields(ControlConfig).items() if not isinstance(field.default, bool)
+]
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, 1.0e300, math.inf, math.nan])
@@ -420,7 +422,7 @@ def test_a_limit_that_protects_nothing_is_refused_with_the_value_and_the_bound(
 ) -> None:
     found = re.escape(f"{field} is {value}")
     with pytest.raises(ValueError, match=f"^{found}, expected above 0 and at most [0-9.]+$"):
-        ControlConfig(**{field: value})
+        make_record(ControlConfig, {field: value})
 
 
 @pytest.mark.parametrize(
@@ -429,7 +431,7 @@ def test_a_limit_that_protects_nothing_is_refused_with_the_value_and_the_bound(
 )
 def test_a_limit_that_no_robot_reaches_is_refused(field: str, value: float) -> None:
     with pytest.raises(ValueError, match=field):
-        ControlConfig(**{field: value})
+        make_record(ControlConfig, {field: value})
 
 
 def test_limits_of_the_command_come_from_the_policy(metadata: PolicyMetadata, rig: Rig) -> None:

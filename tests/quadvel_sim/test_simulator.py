@@ -109,6 +109,42 @@ def test_a_push_with_a_torque_gives_its_angular_impulse() -> None:
     assert sim.data.subtree_angmom[1][2] == pytest.approx(0.5, abs=0.01)
 
 
+def test_a_failed_drive_has_no_torque_and_measures_none_until_the_reset() -> None:
+    sim = simulator()
+    sim.reset("stand")
+    sim.fail_joint("FL_thigh_joint")
+    sim.command(hold())
+    for _ in range(200):
+        sim.step()
+        assert sim.data.ctrl[4] == 0.0
+        assert sim.state().tau[4] == 0.0
+    assert abs(sim.state().q[4] - robot.NOMINAL_Q[4]) > 0.05  # the leg gives way
+    assert abs(sim.state().tau[5]) > 0.1
+    sim.reset("stand")
+    run(sim, hold(), 0.1)
+    assert abs(sim.state().tau[4]) > 0.1
+
+
+def test_a_jammed_joint_hardly_moves_until_the_reset() -> None:
+    sim = simulator(suspended=True)
+    moved = []
+    for jammed in (True, False):
+        sim.reset("stand")
+        if jammed:
+            sim.jam_joint("RR_calf_joint")
+        run(sim, hold(q=robot.NOMINAL_Q + 0.3), 0.04)
+        moved.append(sim.state().q - robot.NOMINAL_Q)
+    assert moved[0][8] < 0.3 * moved[1][8]
+    np.testing.assert_allclose(np.delete(moved[0], 8), np.delete(moved[1], 8), atol=0.02)
+
+
+def test_faults_of_unknown_joints_are_refused() -> None:
+    sim = simulator()
+    for inject in (sim.fail_joint, sim.jam_joint):
+        with pytest.raises(ValueError, match="joint names: found 'tail'"):
+            inject("tail")
+
+
 @pytest.mark.parametrize("keyframe", ["lie", "stand"])
 def test_reset_puts_the_robot_at_rest_with_its_feet_on_the_ground(keyframe: str) -> None:
     sim = simulator()

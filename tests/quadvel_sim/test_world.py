@@ -23,7 +23,8 @@ from quadvel_sim import Simulator, SimulatorConfig, Terrain, World
 from quadvel_sim.laser import Laser
 from quadvel_sim.persons import Persons
 from quadvel_sim.simulator import build_model
-from quadvel_sim.world import SHIPPED_WORLDS, Box, Hill, Patch, Person, Table, Trees, Wall
+from quadvel_sim.world import SHIPPED_WORLDS
+from quadvel_sim.world_parts import Box, Hill, Patch, Person, Table, Trees, Wall
 
 QUIET = {"noise": 0.0, "noise_share": 0.0, "lost": 0.0, "mixed": 0.0}
 AT_TRUNK = Laser(position=(0.0, 0.0, 0.0), field_of_view=360.0, rays=720, range_max=30.0, **QUIET)

@@ -6,7 +6,7 @@ from importlib import import_module
 from pathlib import Path
 
 import quadvel_sysid
-from quadvel_sysid.options import DEVICES
+from quadvel_sysid.options import SEARCH_DEFAULTS
 
 PACKAGE = Path(quadvel_sysid.__file__).parent
 PAGE = Path(__file__).parents[2] / "docs" / "sysid.md"
@@ -63,5 +63,7 @@ def test_the_tuned_constants_have_the_documented_values() -> None:
     rows = re.findall(r"^\| `([\w.]+)\.(\w+)` \| ([\d.]+) \|", PAGE.read_text(), re.MULTILINE)
     assert len(rows) == 29
     for module, name, value in rows:
-        owner = DEVICES if module == "options.Devices" else import_module(f"quadvel_sysid.{module}")
+        owner = (
+            SEARCH_DEFAULTS if module == "options.SearchOptions" else import_module(f"quadvel_sysid.{module}")
+        )
         assert getattr(owner, name) == float(value), f"{module}.{name}"

@@ -7,7 +7,7 @@ from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
 from quadvel_sysid.identify import identify
-from quadvel_sysid.search import library, lost_commands
+from quadvel_sysid.search import context, lost_commands
 
 JOINTS = NAMES[:2]
 
@@ -53,7 +53,7 @@ def test_a_drive_that_lags_after_each_command_alike_loses_none(monkeypatch):
         found.append(looked_for(*given))
         return found[-1]
 
-    monkeypatch.setattr(library, "lost_commands", remembered)
+    monkeypatch.setattr(context, "lost_commands", remembered)
     truth = parameters([Effect("first_order_lag", NAMES[:4], {"T": 0.012})], noise=0.01)
     log = record(attrs.evolve(truth, joints=NAMES[:4]), 4, 3.0, 500, motion="chirp", seed=1)
     assert [one["name"] for one in identify([log]).report["effects"]] == ["first_order_lag"]

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from simulated_joints import NAMES, parameters, record
 
-from quadvel_actuator.effects import registry
+from quadvel_actuator.effects.elastic import Deadband
 from quadvel_sysid.data.signals import Samples, scattered_rows
+from quadvel_sysid.search.effect_candidates.elastic import DeadbandCandidate
 
 JOINTS = NAMES[:2]
 
@@ -50,7 +51,7 @@ def test_grid_of_deadbands_leaves_few_errors_between_its_values():
     """Each error between two values is a jump of the torque that a slope along the width misses."""
     samples = Samples.of([_log(seconds=1.0)])
     s = samples.at(0.009, 0.003, 0.0)
-    starts = registry()["deadband"](edge="hard").initial_guesses(s, samples.tau, samples.tau)
+    starts = DeadbandCandidate(Deadband("hard")).initial_guesses(s, samples.tau, samples.tau)
     widths = np.array([one["width"] for one in starts])
     share = (np.abs(s.q_des - s.q) < widths[:, None]).mean(axis=1)
     assert np.diff(share, axis=0).max() < 0.05

@@ -6,13 +6,17 @@ import pytest
 from joint_logs import fields, npz
 from simulated_joints import NAMES, parameters, record
 
-from quadvel_actuator.effects import registry
+from quadvel_actuator.effects.dynamics import FirstOrderLag, VelocityFilter
+from quadvel_actuator.effects.limits import SlewLimit
 from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.excerpts import has_jitter, restore_even_clock
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.logs.read_log import read_log
-from quadvel_sysid.model.torque_model import AppliedEffect, Model
+from quadvel_sysid.model.applied_effect import AppliedEffect
+from quadvel_sysid.model.torque_model import Model
+from quadvel_sysid.search.effect_candidates.dynamics import LagCandidate, VelocityFilterCandidate
+from quadvel_sysid.search.effect_candidates.limits import SlewLimitCandidate
 
 
 def _slewing(rate):
@@ -37,19 +41,19 @@ def test_a_slew_limit_is_simulated_between_rows():
     rate = 60.0
     log, asked = _slewing(rate)
     tau = log.tau[:, 0]
-    law = registry()["slew_limit"]()
+    candidate = SlewLimitCandidate(SlewLimit())
     one = np.zeros(1, dtype=np.intp)
     gains = np.array([[30.0], [0.0]])
-    limit = AppliedEffect(law, np.ones(1, dtype=bool), np.array([[rate]]), one)
+    limit = AppliedEffect(candidate, np.ones(1, dtype=bool), np.array([[rate]]), one)
     model = Model(Samples.of([log]), 0.0, gains, one, np.zeros((2, 1)), one, (limit,))
     limited = np.abs(asked - tau) > 0.05
     assert limited.mean() > 0.2
     assert np.sqrt(np.mean((model.predict()[:, 0] - tau)[10:] ** 2)) < 0.008
 
 
-def _of_one_joint(log, law, value, input_delay=0.0):
+def _of_one_joint(log, candidate, value, input_delay=0.0):
     one = np.zeros(1, dtype=np.intp)
-    applied = AppliedEffect(law, np.ones(1, dtype=bool), np.array([[value]]), one)
+    applied = AppliedEffect(candidate, np.ones(1, dtype=bool), np.array([[value]]), one)
     gains = np.array([[30.0], [1.0]])
     delays = np.array([[input_delay], [0.0]])
     return Model(Samples.of([log]), 0.0, gains, one, delays, one, (applied,))
@@ -57,11 +61,11 @@ def _of_one_joint(log, law, value, input_delay=0.0):
 
 def test_a_lag_is_recomputed_at_other_delays_with_the_same_commands():
     """On a grid of 2 ms, delays of 0.5 and 1.5 ms see the same commands with another age."""
-    law = registry()["first_order_lag"]()
-    model = _of_one_joint(_driven(0.002, 0.002, 3), law, 0.004, 0.0005)
+    candidate = LagCandidate(FirstOrderLag())
+    model = _of_one_joint(_driven(0.002, 0.002, 3), candidate, 0.004, 0.0005)
     model.predict()
     later = model.with_delays(np.array([[0.0015], [0.0]]))
-    fresh = _of_one_joint(_driven(0.002, 0.002, 3), law, 0.004, 0.0015)
+    fresh = _of_one_joint(_driven(0.002, 0.002, 3), candidate, 0.004, 0.0015)
     assert np.array_equal(later.predict(), fresh.predict())
     assert np.abs(later.predict() - model.predict()).max() > 0.01
 
@@ -73,7 +77,7 @@ def test_a_filtered_velocity_is_simulated_between_rows():
     dq = np.sin(w * t)
     log = Log("sine", NAMES[:1], t, 0.0 * t[:, None], dq[:, None], t, 0.0 * t[:, None], np.ones((len(t), 1), bool),
               tau=0.0 * t[:, None])  # fmt: skip
-    predicted = _of_one_joint(log, registry()["velocity_filter"](), lag).predict()[:, 0]
+    predicted = _of_one_joint(log, VelocityFilterCandidate(VelocityFilter()), lag).predict()[:, 0]
     filtered = np.sin(w * t - np.arctan(w * lag)) / np.hypot(1.0, w * lag)
     settled = t > 0.1
     assert np.abs(predicted + filtered)[settled].max() < 0.01

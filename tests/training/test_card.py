@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 
-onnx = pytest.importorskip("onnx", reason="model cards need onnx: pip install 'quadvel[train]'")
+onnx = pytest.importorskip("onnx", reason="model cards need onnx: pip install 'quadvel-core[train]'")
 
 from quadvel_estimator.learned import SHIPPED_MODEL  # noqa: E402
 from quadvel_eval.grid import Cell, CellResult, summarise  # noqa: E402

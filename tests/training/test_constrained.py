@@ -6,7 +6,7 @@ import attrs
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import loop  # noqa: E402

@@ -6,9 +6,9 @@ import numpy as np
 import onnx
 import pytest
 
-torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
-from quadvel_policy.observation import CommandLimits  # noqa: E402
+from quadvel_policy.observation import VelocityCommandLimits  # noqa: E402
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import dagger, loop  # noqa: E402
 from quadvel_training.dagger import DaggerConfig, DaggerRun  # noqa: E402
@@ -55,7 +55,7 @@ def test_the_file_does_what_the_network_does(run, tmp_path):
 
 
 def test_the_file_holds_its_command_limits_and_how_to_run_it(run, tmp_path):
-    limits = CommandLimits((-1.0, -0.4, -0.7), (2.0, 0.5, 0.7), 3.0)
+    limits = VelocityCommandLimits((-1.0, -0.4, -0.7), (2.0, 0.5, 0.7), 3.0)
     dagger.export_policy(run.student, run.env, limits, tmp_path / "policy.onnx", {})
     metadata = PolicyFile(tmp_path / "policy.onnx").metadata
     assert metadata.limits == limits

@@ -6,7 +6,7 @@ import attrs
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
 from quadvel_description import robot  # noqa: E402
 from quadvel_description.state import JointCommand, RobotState  # noqa: E402
@@ -14,8 +14,8 @@ from quadvel_estimator import features  # noqa: E402
 from quadvel_estimator.kalman import KalmanConfig  # noqa: E402
 from quadvel_estimator.learned import LearnedEstimator  # noqa: E402
 from quadvel_estimator.odometry import leg_velocity  # noqa: E402
+from quadvel_policy.config import SupervisorConfig  # noqa: E402
 from quadvel_policy.modes import ModeInput, Posture  # noqa: E402
-from quadvel_policy.supervisor import SupervisorConfig  # noqa: E402
 from quadvel_training import kalman_tuning, walks  # noqa: E402
 from quadvel_training.env import TICK_S, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.estimator import EstimatorConfig, EstimatorRun, VelocityNetwork  # noqa: E402

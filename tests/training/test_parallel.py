@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
 from quadvel_training import parallel  # noqa: E402
 

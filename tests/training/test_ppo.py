@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
 from quadvel_description import symmetry  # noqa: E402
 from quadvel_training.networks import Gaussian, Mlp, Recurrent, torch_mirror  # noqa: E402

@@ -6,7 +6,7 @@ import attrs
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
 from quadvel_actuator import ActuatorModel
 from quadvel_estimator.learned import LearnedEstimator

@@ -7,7 +7,7 @@ import json
 import attrs
 import pytest
 
-torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
 from quadvel_actuator import ActuatorParameters, Effect  # noqa: E402
 from quadvel_description.robot import JOINT_NAMES  # noqa: E402

@@ -6,7 +6,7 @@ import attrs
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
 from quadvel_description import robot  # noqa: E402
 from quadvel_eval.gait_kind import GaitKind  # noqa: E402

@@ -17,7 +17,7 @@ from rich.progress import Progress, TextColumn
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_estimator.kalman import KalmanConfig
 from quadvel_eval.paper import gap
-from quadvel_policy.observation import CommandLimits
+from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 
 from . import (
@@ -310,7 +310,7 @@ def limit(
         low[axis] = low[axis] if back is None else -back
         high[axis] = high[axis] if ahead is None else ahead
     limiting.limit_commands(
-        policy, CommandLimits((low[0], low[1], low[2]), (high[0], high[1], high[2]), known.curve)
+        policy, VelocityCommandLimits((low[0], low[1], low[2]), (high[0], high[1], high[2]), known.curve)
     )
     _written(policy)
 

@@ -108,7 +108,7 @@ class Walk(Noise):
 
     def _observe(self) -> tuple[torch.Tensor, torch.Tensor]:
         obs = dagger.observe(self.run.env, self.action)
-        return torch.from_numpy(obs), torch.from_numpy(self.run._critic_obs())
+        return torch.from_numpy(obs), torch.from_numpy(self.run.critic_obs())
 
     @override
     def reset(self, *, indices: Any = None, **_: Any) -> tuple[Any, ...]:

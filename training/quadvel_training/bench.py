@@ -15,6 +15,7 @@ import torch
 from mujoco.batch import Batch
 
 from quadvel_description.arrays import Array
+from quadvel_eval.bench import Benchmark
 from quadvel_policy.observation import DEFAULT_OBSERVATION
 
 from . import dagger
@@ -154,3 +155,24 @@ def training(config: ConstrainedConfig | None = None, updates: int = 5) -> dict[
     bare = np.sum([calls * seconds[name] for name, (_, calls) in parts.items()], axis=0)
     shares = {f"{part}_share": float(np.mean([one[part] for one in seen])) for part in PARTS}
     return _rate_and_ratio("samples", config.n * config.length, seconds["whole"], bare) | shares
+
+
+ENVIRONMENT = Benchmark(
+    environment,
+    (
+        ("steps_per_s", "training environment, steps/s", ""),
+        ("ratio", "divided by that of the bare batch", "0.7 or more"),
+    ),
+)
+TRAINING = Benchmark(
+    training,
+    (
+        ("samples_per_s", "training, policy samples/s", ""),
+        ("ratio", "divided by that of bare steps and passes", "0.6 or more"),
+        ("physics_share", "share of training time: physics and actuators", ""),
+        ("sensing_share", "share: observations and rewards", ""),
+        ("inference_share", "share: inference", ""),
+        ("learning_share", "share: learning", ""),
+    ),
+)
+"""Entry points of `quadvel bench`, as ENVIRONMENT."""

@@ -70,7 +70,8 @@ ESTIMATOR = "A recurrent estimator of the AlienGo's linear velocity from IMU, en
 
 def _metadata(network: Path) -> dict[str, Any]:
     """Read the metadata of a network file."""
-    texts = {entry.key: entry.value for entry in read_network(network).metadata_props}
+    entries = read_network(network).all("metadata_props")
+    texts = {entry.one("key"): entry.one("value") for entry in entries}
     if METADATA_KEY not in texts:
         raise ValueError(f"{network}: no metadata {METADATA_KEY}, expected a policy or an estimator")
     found: dict[str, Any] = json.loads(texts[METADATA_KEY])

@@ -4,7 +4,7 @@ Source: Margolis et al., Rapid Locomotion via Reinforcement Learning, Section II
 
 Cells span vx, vy and yaw rate. Open cells are those near rest, those whose commands are followed
 well in xy and yaw without a fall, and their neighbours. They close again if commands are followed
-no longer. Commands are drawn from open cells and limited by `CommandLimits`.
+no longer. Commands are drawn from open cells and limited by `VelocityCommandLimits`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import attrs
 import numpy as np
 import torch
 
-from quadvel_policy.observation import CommandLimits
+from quadvel_policy.observation import VelocityCommandLimits
 
 from .loop import CheckpointError
 
@@ -34,7 +34,7 @@ class GridConfig:
         vx: m/s, from and to.
         vy: m/s, either way.
         wz: rad/s, either way.
-        curve: m/s^2, limit in curves of `CommandLimits`.
+        curve: m/s^2, limit in curves of `VelocityCommandLimits`.
         stance: share of commands to stand; setting off is where robots fall most.
         straight: share of commands without yaw.
         near: share of commands near rest, which are few among all cells.
@@ -61,15 +61,17 @@ class GridConfig:
     error_wz: float = 0.12
     error_share: float = 0.06
 
-    answered: CommandLimits = CommandLimits((-2.9, -2.0, -5.0), (2.9, 2.0, 5.0), curve=3.6)
+    answered: VelocityCommandLimits = VelocityCommandLimits((-2.9, -2.0, -5.0), (2.9, 2.0, 5.0), curve=3.6)
 
-    def limits(self) -> CommandLimits:
+    def limits(self) -> VelocityCommandLimits:
         """Return the limits of the grid.
 
         Returns:
             Limits of the commands that may be drawn.
         """
-        return CommandLimits((self.vx[0], -self.vy, -self.wz), (self.vx[1], self.vy, self.wz), self.curve)
+        return VelocityCommandLimits(
+            (self.vx[0], -self.vy, -self.wz), (self.vx[1], self.vy, self.wz), self.curve
+        )
 
 
 class CommandGrid:

@@ -252,8 +252,12 @@ class ConstrainedRun:
             | self.shares.take()
         )
 
-    def _critic_obs(self) -> np.ndarray:
-        """Return the critic's observations (n, CRITIC_SIZE)."""
+    def critic_obs(self) -> np.ndarray:
+        """Compute the critic's observations.
+
+        Returns:
+            (n, CRITIC_SIZE), float32.
+        """
         env, past = self.env, self.past
         known = privileged.observe(env, past, self._action)
         seen = known, privileged.critic_extra(env, past), 0.05 * env.torque, self._noise
@@ -280,7 +284,7 @@ class ConstrainedRun:
         state, start, mirrored_start, before = self._state, self._state, self._mirrored, self._noise
         for _ in range(c.length):
             with self.shares.measure("sensing"):
-                obs, critic_obs = dagger.observe(env, self._action), self._critic_obs()
+                obs, critic_obs = dagger.observe(env, self._action), self.critic_obs()
                 standing = past.standing
             with self.shares.measure("inference"):
                 mean, state = self._act(obs, state)
@@ -312,7 +316,7 @@ class ConstrainedRun:
         self.scorer.report_to(self.grid)
         self.samples += c.length * c.n * parallel.size()
         rows = {name: np.array(value, dtype=np.float32) for name, value in keep.items()}
-        rows |= {"noise": before, "spread": self._spread, "last_critic_obs": self._critic_obs()}
+        rows |= {"noise": before, "spread": self._spread, "last_critic_obs": self.critic_obs()}
         t = {name: torch.from_numpy(value).to(self.device) for name, value in rows.items()}
         rollout = Rollout(**t, state=start, mirrored_state=mirrored_start)
         seen = self._figures(t, alive)

@@ -25,8 +25,8 @@ from quadvel_policy.observation import (
     COMMAND_AXES,
     DEFAULT_OBSERVATION,
     ActionMap,
-    CommandLimits,
     PolicyMetadata,
+    VelocityCommandLimits,
     build_observation,
 )
 from quadvel_sim.terrain import Terrain
@@ -390,7 +390,7 @@ def observe(env: VelocityEnv, previous: np.ndarray) -> np.ndarray:
 
 
 def export_policy(
-    network: Recurrent, env: VelocityEnv, limits: CommandLimits, path: Path, about: dict[str, Any]
+    network: Recurrent, env: VelocityEnv, limits: VelocityCommandLimits, path: Path, about: dict[str, Any]
 ) -> None:
     """Write a policy file.
 

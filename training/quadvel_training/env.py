@@ -20,7 +20,7 @@ from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf, robot
 from quadvel_description.command_range import split_target
 from quadvel_description.kinematics import foot_kinematics, foot_positions, roll_pitch, rotate, rotate_inverse
-from quadvel_policy.observation import CommandLimits
+from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_sim.physics import Physics
 from quadvel_sim.terrain import Terrain
 
@@ -56,7 +56,7 @@ class CommandRange:
         vy: m/s, either way.
         wz: rad/s, either way.
         ellipsoid: draw from the ellipsoid within the box.
-        curve: m/s^2, limit in curves as in `quadvel_policy.observation.CommandLimits`; None for no
+        curve: m/s^2, limit in curves as in `quadvel_policy.observation.VelocityCommandLimits`; None for no
             limit.
         stance: share of commands to stand.
         straight: share of the walking commands without yaw.
@@ -91,7 +91,7 @@ class CommandRange:
         command[:, :3] = unit * [half, self.vy, self.wz] + [centre, 0.0, 0.0]
         command[rng.random(n) < self.straight, 2] = 0.0
         if self.curve:
-            limits = CommandLimits(
+            limits = VelocityCommandLimits(
                 (self.vx[0], -self.vy, -self.wz), (self.vx[1], self.vy, self.wz), self.curve
             )
             command[:, :3] = [limits.clamp(one) for one in command[:, :3].tolist()]

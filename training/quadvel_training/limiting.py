@@ -5,16 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import attrs
-import onnx
 
 from quadvel_description.network_file import read_network
+from quadvel_description.onnx_format import message, serialise
 from quadvel_description.recurrent_network import METADATA_KEY
-from quadvel_policy.observation import COMMAND_AXES, CommandLimits
+from quadvel_policy.observation import COMMAND_AXES, VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_recordings.output import replacing
 
 
-def limit_commands(policy: Path, limits: CommandLimits) -> None:
+def limit_commands(policy: Path, limits: VelocityCommandLimits) -> None:
     """Rewrite the command limits in a policy file's metadata; everything else stays.
 
     Args:
@@ -36,6 +36,7 @@ def limit_commands(policy: Path, limits: CommandLimits) -> None:
             )
     narrowed = attrs.evolve(metadata, command_limits=bounds, curve_limit=limits.curve)
     model = read_network(policy)
-    onnx.helper.set_model_props(model, {METADATA_KEY: narrowed.to_json()})
+    text = message("StringStringEntryProto", key=METADATA_KEY, value=narrowed.to_json())
+    model.fields["metadata_props"] = [text]
     with replacing(policy) as draft:
-        onnx.save(model, draft)
+        draft.write_bytes(serialise(model))

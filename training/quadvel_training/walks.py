@@ -15,8 +15,8 @@ import torch
 from quadvel_description import robot
 from quadvel_description.command_range import clip_to_command_range
 from quadvel_description.state import RobotState
+from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.observation import DEFAULT_OBSERVATION, build_observation
-from quadvel_policy.supervisor import SupervisorConfig
 from quadvel_sim.config import SensorNoise
 from quadvel_sim.terrain import Terrain
 

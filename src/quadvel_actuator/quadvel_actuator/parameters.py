@@ -1,7 +1,7 @@
 """Parameters of the empirical actuator model and their YAML file.
 
-`quadvel_actuator.model` computes torques from these parameters. `quadvel_sysid` identifies them
-from measured logs. The shipped default is Table 4 of the paper.
+`quadvel_actuator.model` computes torques from these parameters. The shipped default is
+Table 4 of the paper.
 """
 
 from __future__ import annotations

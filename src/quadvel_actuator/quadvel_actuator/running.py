@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from quadvel_actuator.delay import DelayLine
-from quadvel_actuator.effects import DRIVE, JOINT, EffectLaw, MemoryLaw, Stage, registry
-from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
-from quadvel_actuator.effects.terms import RunningTerms, Term, load_terms
+from quadvel_actuator.effects import DRIVE, JOINT, EffectModel, Stage, registry
+from quadvel_actuator.effects.basis_regressors import LEARNED_RESIDUAL, BasisRegressor, RunningRegressors
+from quadvel_actuator.effects.regressor_entries import load_regressors
 from quadvel_actuator.parameters import Effect
 from quadvel_description.arrays import Array, Bools
 
@@ -32,7 +32,6 @@ class StepView:
 
     temperature = 25.0
     voltage = np.inf
-    packet = row = sent = None
 
     def __init__(self, shape: tuple[int, ...], dt: float) -> None:
         """Create a view of a robot at rest.
@@ -100,7 +99,7 @@ class _RunningEffect:
             form, numbers = registry()[effect.name].parse(given, tuple(joints))
         except ValueError as error:
             raise ValueError(f"effects/{effect.name}/parameters/{error}") from None
-        self.law: EffectLaw = form.runtime_form(rng)
+        self.model: EffectModel = form.runtime_form(rng)
         self.active = np.array([name in effect.joints for name in joints])
         self.everywhere = bool(self.active.all())
         self.values = {
@@ -130,32 +129,14 @@ class _RunningEffect:
             share = rng.random((*drawn[:-1], drawn[-1] if low.ndim else 1))
             values[ids] = np.where(self.active, low + share * (high - low), values[ids])
             self.values[name] = values
-        self.values = self.law.canonical(self.values)
+        self.values = self.model.canonical(self.values)
 
     def apply(self, x: Any, now: StepView, new: Bools | None) -> Any:
         """Return the value in place of `x`; environments that are `new` start from rest."""
-        law = self.law
-        if isinstance(law, MemoryLaw):
-            u = [getattr(now, name) for name in law.inputs]
-            if new is not None:
-                rest = law.rest(x, u, self.values)
-                whole = not self.memory or bool(new.all())
-                self.memory = (
-                    rest
-                    if whole
-                    else tuple(
-                        np.where(new[..., None], fresh, old)
-                        for fresh, old in zip(rest, self.memory, strict=True)
-                    )
-                )
-            after, self.memory = law.advance(x, u, now.dt, self.values, self.memory)
-        elif law.stage == Stage.ERRORS:
-            after = law.errors(x, now, self.values)  # type: ignore[attr-defined]
-        else:
-            after = law.torque(x, now, self.values)  # type: ignore[attr-defined]
+        after, self.memory = self.model.step(x, now, self.values, self.memory, new)
         if self.everywhere:
             return after
-        if law.stage == Stage.ADDED:
+        if self.model.stage == Stage.ADDED:
             return after * self.active
         if isinstance(x, tuple):
             return tuple(np.where(self.active, one, old) for one, old in zip(after, x, strict=True))
@@ -207,10 +188,10 @@ def _interval_bounds(
     return low, high
 
 
-def _load_terms(effect: Effect, joints: Sequence[str]) -> list[Term]:
-    """Load the terms of an effect of the name `learned_residual`."""
+def _load_regressors(effect: Effect, joints: Sequence[str]) -> list[BasisRegressor]:
+    """Load the basis regressors of an effect of the name `learned_residual`."""
     try:
-        return load_terms(effect.parameters.get("terms"), joints)
+        return load_regressors(effect.parameters.get("terms"), joints)
     except ValueError as error:
         raise ValueError(f"effects/{effect.name}/parameters/{error}") from None
 
@@ -238,16 +219,21 @@ class RunningEffects:
             ValueError: an entry names an unknown effect, joint or parameter, or has a wrong value.
         """
         rng = np.random.default_rng([seed, 1])
-        laws = [one for one in effects if one.name != TERMS]
-        self._all = sorted((_RunningEffect(one, joints, rng) for one in laws), key=lambda one: one.law.stage)
-        self._errors = [one for one in self._all if one.law.stage == Stage.ERRORS]
-        self._torques = [one for one in self._all if Stage.ERRORS < one.law.stage < Stage.ADDED]
-        added = [one for one in self._all if one.law.stage == Stage.ADDED]
-        self._added = [one for one in added if one.law.at == DRIVE]
-        self._at_joint = [one for one in added if one.law.at == JOINT]
-        terms = [term for one in effects if one.name == TERMS for term in _load_terms(one, joints)]
-        self._terms, self._terms_at_joint = (
-            RunningTerms([one for one in terms if one.at == at], joints, dt) for at in (DRIVE, JOINT)
+        named = [one for one in effects if one.name != LEARNED_RESIDUAL]
+        self._all = sorted(
+            (_RunningEffect(one, joints, rng) for one in named), key=lambda one: one.model.stage
+        )
+        self._errors = [one for one in self._all if one.model.stage == Stage.ERRORS]
+        self._torques = [one for one in self._all if Stage.ERRORS < one.model.stage < Stage.ADDED]
+        added = [one for one in self._all if one.model.stage == Stage.ADDED]
+        self._added = [one for one in added if one.model.at == DRIVE]
+        self._at_joint = [one for one in added if one.model.at == JOINT]
+        regressors = [
+            each for one in effects if one.name == LEARNED_RESIDUAL for each in _load_regressors(one, joints)
+        ]
+        self._regressors, self._regressors_at_joint = (
+            RunningRegressors([one for one in regressors if one.at == at], joints, dt)
+            for at in (DRIVE, JOINT)
         )
         self._now = StepView(shape, dt)
         self.targets = DelayLine((*shape[:-1], 2 * shape[-1]), dt)  # q_des, dq_des
@@ -313,7 +299,7 @@ class RunningEffects:
         total = torque
         for one in self._added:
             total = total + one.apply(torque, now, new)
-        return total + self._terms.step(total, now, new)
+        return total + self._regressors.step(total, now, new)
 
     def joint_torque(self, torque: Array, new: Bools | None) -> Array:
         """Add the effects that act at the joint.
@@ -328,7 +314,7 @@ class RunningEffects:
         total = torque
         for one in self._at_joint:
             total = total + one.apply(torque, self._now, new)
-        return total + self._terms_at_joint.step(total, self._now, new)
+        return total + self._regressors_at_joint.step(total, self._now, new)
 
     def _update_view(self, q: Array, dq: Array, new: Bools | None) -> StepView:
         """Take the state of this step into the view and its history."""
@@ -346,9 +332,9 @@ class RunningEffects:
         return now
 
     @property
-    def _memories(self) -> list[_RunningEffect | RunningTerms]:
+    def _memories(self) -> list[_RunningEffect | RunningRegressors]:
         """Everything with a memory."""
-        return [*self._all, self._terms, self._terms_at_joint]
+        return [*self._all, self._regressors, self._regressors_at_joint]
 
     def save_memory(self) -> Any:
         """Copy everything that a step changes.

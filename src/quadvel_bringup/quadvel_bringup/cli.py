@@ -12,6 +12,7 @@ import attrs
 import typer
 from typer.core import TyperGroup
 
+from .installation import check_installed
 from .nodes import NODES
 from .stack import PARAMETERS, Stack
 
@@ -77,11 +78,13 @@ class DelegatedCommand:
 
     Attributes:
         target: "module:member", a function or a typer application.
+        extra: Extra of quadvel-core with the libraries that it needs.
         panel: Its panel in the help.
         about: Its line in the help.
     """
 
     target: str
+    extra: str
     panel: str
     about: str
 
@@ -89,76 +92,91 @@ class DelegatedCommand:
 DELEGATED_COMMANDS = {
     "demo": DelegatedCommand(
         "quadvel_lab.demo:demo_command",
+        "eval",
         SIMULATOR,
         "Walk a simulated robot in all directions, or after a person.",
     ),
     "world": DelegatedCommand(
         "quadvel_eval.world_map:world_command",
+        "eval",
         SIMULATOR,
         "Check the file of a world, and draw a map of it.",
     ),
     "plot": DelegatedCommand(
         "quadvel_eval.recording_plot:plot_command",
+        "eval",
         LOGS,
         "Plot velocity, joints, torques and loop timing of a recording.",
     ),
     "replay": DelegatedCommand(
         "quadvel_eval.offline:replay_command",
+        "eval",
         LOGS,
         "Run actuator model and estimator offline on a recording.",
     ),
     "excite": DelegatedCommand(
         "quadvel_lab.excite:excite_command",
+        "eval",
         LOGS,
         "Run an excitation motion and record it for identification.",
     ),
     "identify": DelegatedCommand(
         "quadvel_sysid.cli:app",
+        "identify",
         LOGS,
         "Identify what the actuator model lacks, from measured logs.",
     ),
     "calibrate": DelegatedCommand(
         "quadvel_bringup.calibrate:calibrate_command",
+        "identify",
         LOGS,
         "Estimate the zero offsets of encoders and IMU.",
     ),
     "eval": DelegatedCommand(
         "quadvel_eval.cli:eval_command",
+        "eval",
         EVALUATION,
         "Measure velocity tracking of a policy on a command grid.",
     ),
     "compare": DelegatedCommand(
         "quadvel_eval.cli:compare_command",
+        "eval",
         EVALUATION,
         "Compare two evaluations.",
     ),
     "faults": DelegatedCommand(
         "quadvel_eval.cli:faults_command",
+        "eval",
         EVALUATION,
         "Inject faults into a simulated robot and measure the reaction.",
     ),
     "people": DelegatedCommand(
         "quadvel_eval.people.cli:people_command",
+        "eval",
         EVALUATION,
         "Measure detection and tracking of people in laser scans.",
     ),
     "following": DelegatedCommand(
         "quadvel_eval.following.cli:following_command",
+        "eval",
         EVALUATION,
         "Measure person following in simulated planar scenes.",
     ),
     "bench": DelegatedCommand(
         "quadvel_eval.cli:bench_command",
+        "eval",
         EVALUATION,
         "Measure the speed of simulator, policy and control loop.",
     ),
     "paper": DelegatedCommand(
         "quadvel_eval.paper.cli:paper_command",
+        "eval",
         EXPERIMENTS,
         "Reproduce the figures of the paper: page, plots, tables.",
     ),
     "twin": DelegatedCommand(
         "quadvel_lab.ground_truth_benchmark:twin_command",
+        "eval",
         EXPERIMENTS,
         "Benchmark the identification on plants with hidden effects.",
     ),
@@ -220,11 +238,13 @@ def run(
 ) -> None:
     """Run one node in this process; the help is RUN_HELP."""
     from . import nodes
+    from .preflight import check_arguments
 
     arguments = [*context.args]
     if actuator is not None:
         file = json.dumps(str(actuator.resolve()))
         arguments = [*(arguments or ["--ros-args"]), "-p", f"actuator_file:={file}"]
+    check_arguments(node, arguments)
     nodes.run(node, arguments)
 
 
@@ -312,13 +332,14 @@ def view(
 ) -> None:
     """Serve the operator page in the browser, or play a recording.
 
-    It prints the address to open. It requires the extra quadvel[view].
+    It prints the address to open. It requires the extra quadvel-core[view].
 
     \b
     For example:
       quadvel view
       quadvel view out/demo/demo.mcap
     """
+    check_installed("view", "quadvel_view", "view")
     from .view import view as run_view
 
     run_view(recording, host, port, foxglove)
@@ -359,6 +380,8 @@ def teleop(
       quadvel teleop
       quadvel teleop gamepad
     """
+    if by == "gamepad":
+        check_installed("teleop gamepad", "quadvel_view", "view")
     module = _with_middleware("teleop")
     raise typer.Exit(module.drive_by_keyboard() if by == "keyboard" else module.drive_by_gamepad())
 
@@ -496,6 +519,7 @@ def record(
       quadvel record low_state low_cmd --out walk.mcap
       quadvel record --ring 30 --out out/faults
     """
+    check_installed("record", "quadvel_recordings", "log")
     from .record import record as run_record
     from .record import record_faults
 
@@ -536,10 +560,15 @@ def command(name: str) -> Any:
 
     Returns:
         The command as a click object. KeyError is raised if there is none.
+
+    Raises:
+        ValueError: The command is not installed; the sentence says how to install it.
     """
     if name not in DELEGATED_COMMANDS:
         return typer.main.get_group(app).commands[name]
-    module, _, member = DELEGATED_COMMANDS[name].target.partition(":")
+    delegated = DELEGATED_COMMANDS[name]
+    module, _, member = delegated.target.partition(":")
+    check_installed(name, module, delegated.extra)
     found = getattr(import_module(module), member)
     if isinstance(found, typer.Typer):
         return typer.main.get_command(found)

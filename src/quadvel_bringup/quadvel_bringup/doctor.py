@@ -15,9 +15,10 @@ import numpy as np
 
 import quadvel_dds
 
-REQUIRED_PACKAGES = ("mujoco", "onnx", "onnxruntime", "cyclonedds", "rosbags", "mcap", "numpy", "scipy")
-FILE_KEYS = ("actuator", "policy")
-"""Keys of /diagnostics with the files of a node."""
+ROBOT_PACKAGES = ("numpy", "cyclonedds", "onnxruntime", "rosbags")
+"""Packages that the nodes of a robot need."""
+REQUIRED_PACKAGES = {**dict.fromkeys(ROBOT_PACKAGES, "robot"), "mcap": "log", "mujoco": "sim", "scipy": "sim"}
+"""Packages that the simulated robot needs, and the extra of quadvel-core that installs them."""
 GL_BACKENDS = ("egl", "osmesa")
 GL_PACKAGES = "libegl1 libopengl0"
 
@@ -59,7 +60,7 @@ def _robot() -> Finding:
     """Check for a running robot and its actuator model."""
     try:
         quadvel_dds.install()
-        from .status import running_nodes
+        from .status import FILE_KEYS, running_nodes
         from .whereabouts import discovery_hint
     except ImportError as error:
         return Finding("robot", True, f"not checked: {error}")
@@ -120,7 +121,7 @@ def _package(name: str) -> Finding:
     try:
         return Finding(name, True, metadata.version(name))
     except metadata.PackageNotFoundError:
-        return Finding(name, False, "missing: make setup")
+        return Finding(name, False, f"missing: pip install 'quadvel-core[{REQUIRED_PACKAGES[name]}]'")
 
 
 def _clock(period: float = 0.005, ticks: int = 100) -> Finding:
@@ -185,7 +186,7 @@ def video_encoder() -> Finding:
 
         subprocess.run([get_ffmpeg_exe(), "-version"], capture_output=True, check=True)
     except ImportError:
-        return Finding("ffmpeg", False, "imageio-ffmpeg is missing, so no video; pip install -e '.[video]'")
+        return Finding("ffmpeg", False, "imageio-ffmpeg is missing, so no video; pip install -e '.[eval]'")
     except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
         reason = " ".join(str(error).split())
         return Finding("ffmpeg", False, f"imageio-ffmpeg has no working program, so no video: {reason}")
@@ -212,7 +213,9 @@ def abilities(findings: list[Finding]) -> Iterator[tuple[str, bool]]:
     """
     good = {finding.subject: finding.good for finding in findings}
     runs = good["Python"] and all(good[name] for name in REQUIRED_PACKAGES)
+    robot = good["Python"] and all(good[name] for name in ROBOT_PACKAGES)
     torch = any(finding.subject == "torch" and "training can run" in finding.text for finding in findings)
+    yield "a robot's nodes (quadvel up --low-level aliengo), drive, status", robot
     yield "quadvel demo, up, run, record", runs
     yield "quadvel eval, bench", runs
     yield "the video of the demo", runs and good["GL"] and good["ffmpeg"]

@@ -11,8 +11,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import quadvel_dds
-
 TOPIC = "low_state"
 SERVERS = ("sim_node", "board", "driver", "quadvel_lab.plant")
 """Words on the command lines of processes that serve TOPIC."""
@@ -119,12 +117,3 @@ def _starter(pid: int) -> str:
         if program in words[:-1]:
             return f", started by quadvel {words[words.index(program) + 1]}, pid {parent.name}"
     return ""
-
-
-def check_exclusive() -> None:
-    """Run `ensure_exclusive` with a temporary node."""
-    quadvel_dds.install()
-    from .session import Session
-
-    with Session("look_for_others") as session:
-        ensure_exclusive(session.node)

@@ -14,6 +14,8 @@ from typing import Any
 
 import attrs
 
+from .installation import check_installed
+
 Parameters = Mapping[str, bool | str | int | float]
 
 
@@ -24,10 +26,12 @@ class NodeEntry:
     Attributes:
         module: Module with its `main`.
         about: What it does, in a few words.
+        extra: Extra of quadvel-core with the libraries that it needs.
     """
 
     module: str
     about: str
+    extra: str = "robot"
 
     @property
     def package(self) -> str:
@@ -36,19 +40,29 @@ class NodeEntry:
 
 
 NODES = {
-    "sim_node": NodeEntry("quadvel_sim.sim_node", "the simulated robot: MuJoCo behind low_state and low_cmd"),
-    "board": NodeEntry("quadvel_sim.board_node", "the same robot behind the UDP interface of the AlienGo"),
+    "sim_node": NodeEntry(
+        "quadvel_sim.sim_node", "the simulated robot: MuJoCo behind low_state and low_cmd", "sim"
+    ),
+    "board": NodeEntry(
+        "quadvel_sim.board_node", "the same robot behind the UDP interface of the AlienGo", "sim"
+    ),
     "driver": NodeEntry("quadvel_driver.driver", "the real AlienGo: its UDP interface and its remote"),
     "estimator": NodeEntry("quadvel_estimator.estimator", "estimates linear velocity from IMU and encoders"),
     "controller": NodeEntry("quadvel_policy.controller", "runs the policy at 200 Hz, its modes and guards"),
     "command_mux": NodeEntry("quadvel_policy.command_mux_node", "selects a velocity source by priority"),
     "person_tracker": NodeEntry(
-        "quadvel_follow.person_tracker_node", "detects and tracks people in 2-D laser scans"
+        "quadvel_follow.person_tracker_node", "detects and tracks people in 2-D laser scans", "follow"
     ),
-    "follow_planner": NodeEntry("quadvel_follow.follow_planner_node", "follows a person, at a set distance"),
-    "trajectory_planner": NodeEntry("quadvel_follow.trajectory_planner", "walks a path from a file"),
-    "view": NodeEntry("quadvel_view.view_node", "the operator's page in the browser"),
-    "planner": NodeEntry("quadvel_lab.scripted_planner", "commands a scripted walk, as the demo does"),
+    "follow_planner": NodeEntry(
+        "quadvel_follow.follow_planner_node", "follows a person, at a set distance", "follow"
+    ),
+    "trajectory_planner": NodeEntry(
+        "quadvel_follow.trajectory_planner", "walks a path from a file", "follow"
+    ),
+    "view": NodeEntry("quadvel_view.view_node", "the operator's page in the browser", "view"),
+    "planner": NodeEntry(
+        "quadvel_lab.scripted_planner", "commands a scripted walk, as the demo does", "eval"
+    ),
 }
 
 
@@ -69,6 +83,23 @@ def node_entry(name: str) -> NodeEntry:
     return NODES[name]
 
 
+def installed_node(name: str) -> NodeEntry:
+    """Return the entry of a node that is installed here.
+
+    Args:
+        name: The node.
+
+    Returns:
+        Its entry.
+
+    Raises:
+        ValueError: There is no such node, or it is not installed; the sentence says how to install it.
+    """
+    entry = node_entry(name)
+    check_installed(name, entry.module, entry.extra)
+    return entry
+
+
 def run(name: str, arguments: Sequence[str]) -> None:
     """Run a node in this process until it ends, as `ros2 run` would.
 
@@ -79,9 +110,9 @@ def run(name: str, arguments: Sequence[str]) -> None:
         arguments: Arguments of ROS 2 ("--ros-args", "-p", "terrain:=rough", ...).
 
     Raises:
-        ValueError: The node is unknown, or an argument is not one of ROS 2.
+        ValueError: The node is unknown or not installed, or an argument is not one of ROS 2.
     """
-    module = node_entry(name).module
+    module = installed_node(name).module
     if arguments and arguments[0] != "--ros-args":
         raise ValueError(f"unexpected argument '{arguments[0]}'; set parameters by --ros-args -p NAME:=VALUE")
     import quadvel_dds
@@ -149,8 +180,11 @@ def process_command(name: str, arguments: Sequence[str] = ()) -> list[str]:
 
     Returns:
         The command line.
+
+    Raises:
+        ValueError: The node is unknown or not installed.
     """
-    node_entry(name)
+    installed_node(name)
     return [sys.executable, "-m", "quadvel_bringup.nodes", name, *arguments]
 
 

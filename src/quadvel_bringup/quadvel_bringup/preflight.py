@@ -6,7 +6,9 @@ module builds the same records from the same values.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from difflib import get_close_matches
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -14,10 +16,14 @@ from typing import Any
 import attrs
 
 import quadvel_dds
-from quadvel_dds.arguments import parse, read_parameter_file
+from quadvel_dds.arguments import InvalidROSArgsError, ParameterOverride, parse, read_parameter_file
+from quadvel_nodes.parameters import make_record, parameter_fields
 
-from .nodes import NODES
-from .stack import Stack
+from .nodes import NODES, installed_node, node_entry
+from .stack import PARAMETERS, Stack
+
+RCLPY_PARAMETERS = ("use_sim_time", "start_type_description_service")
+"""Parameters that every node has."""
 
 
 @attrs.frozen
@@ -67,7 +73,7 @@ def check_stack(stack: Stack) -> None:
         stack: The nodes and their parameters.
     """
     quadvel_dds.install()
-    _check_names(stack.parameters)
+    _check_file(stack.parameters)
     for name, arguments in stack.arguments().items():
         if name in NODE_CHECKS:
             check_node(name, arguments)
@@ -80,41 +86,97 @@ def check_node(name: str, arguments: Sequence[str]) -> None:
         name: The node.
         arguments: Its arguments of ROS 2.
     """
+    installed_node(name)
     _check(name, NODE_CHECKS[name], parse(arguments).parameters_for(f"/{name}"))
 
 
-def _check_names(file: Path) -> None:
-    """Check that each section of a parameter file belongs to a node."""
+def check_arguments(name: str, arguments: Sequence[str]) -> None:
+    """Check that the arguments of one node name only nodes and parameters that exist.
+
+    A node itself ignores sections for others, so a misspelt one would have no effect.
+
+    Args:
+        name: The node, which may be renamed by a remapping.
+        arguments: Its arguments of ROS 2. Malformed ones are left to its middleware.
+
+    Raises:
+        ValueError: There is no such node or parameter; the sentence has the nearest name.
+    """
+    node_entry(name)
+    try:
+        found = parse(arguments)
+    except InvalidROSArgsError:
+        return
+    names = {node: node for node in NODES}
+    names |= {rule.value: name for rule in found.remappings if rule.name == "__node"}
+    namespaces = {override.pattern.rpartition("/")[0] for override in found.overrides}
+    _check_names(
+        found.overrides, {f"{space}/{own}": node for space in namespaces for own, node in names.items()}
+    )
+
+
+def _check_file(file: Path) -> None:
+    """Check that a parameter file names only nodes and parameters that exist, also of nodes that do not start."""
     try:
         overrides = read_parameter_file(file)
     except ValueError as error:
         raise ValueError(" ".join(str(error).split())) from None  # errors of YAML have several lines
     if not overrides:
         raise ValueError(f"{file}: found no section with parameters, expected one of {', '.join(NODES)}")
-    for pattern in dict.fromkeys(override.pattern for override in overrides):
-        of_it = next(override for override in overrides if override.pattern == pattern)
-        if not any(of_it.applies_to(f"/{name}") for name in NODES):
-            raise ValueError(f"{file}: found a section for '{pattern}', expected one of {', '.join(NODES)}")
+    try:
+        _check_names(overrides, {f"/{node}": node for node in NODES})
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+
+
+def _check_names(overrides: Iterable[ParameterOverride], nodes: Mapping[str, str]) -> None:
+    """Check names of nodes and parameters; `nodes`: key in NODES by full name."""
+    for override in overrides:
+        meant = {node for full_name, node in nodes.items() if override.applies_to(full_name)}
+        if not meant:
+            hint = _hint(override.pattern.rpartition("/")[2], NODES)
+            raise ValueError(f"found a section for '{override.pattern}', {hint}")
+        known = [name for node in NODES if node in meant for name in _parameter_names()[node]]
+        if override.name not in known and not _is_of_rclpy(override.name):
+            place = meant.pop() if len(meant) == 1 else override.pattern
+            raise ValueError(f"{place}: found the parameter {override.name}, {_hint(override.name, known)}")
+
+
+@cache
+def _parameter_names() -> dict[str, list[str]]:
+    """Return the parameters of each node: the shipped parameter file holds them all."""
+    names: dict[str, list[str]] = {node: [] for node in NODES}
+    for override in read_parameter_file(PARAMETERS):
+        names[override.pattern.strip("/")].append(override.name)
+    return names
+
+
+def _is_of_rclpy(parameter: str) -> bool:
+    return parameter in RCLPY_PARAMETERS or parameter.startswith("qos_overrides.")
+
+
+def _hint(found: str, known: Iterable[str]) -> str:
+    """Return the nearest name, or all names if none is near."""
+    near = get_close_matches(found, [*known], 1)
+    return f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
 
 
 def _check(name: str, part: NodeCheck, values: Mapping[str, Any]) -> None:
     """Check names, types and values of the parameters of a node."""
     module, _, record = part.record.partition(":")
     kind = getattr(import_module(module), record)
-    defaults = {field.name: field.default for field in attrs.fields(kind)}
+    defaults = {name: field.default for name, field in parameter_fields(kind).items()}
     for parameter, value in values.items():
-        if parameter == "use_sim_time" or parameter.startswith("qos_overrides."):
+        if _is_of_rclpy(parameter):
             continue
         if parameter not in defaults:
-            raise ValueError(
-                f"{name}: found the parameter {parameter}, expected one of {', '.join(defaults)}"
-            )
+            raise ValueError(f"{name}: found the parameter {parameter}, {_hint(parameter, defaults)}")
         wanted = type(defaults[parameter])
         if wanted is not (tuple if isinstance(value, list) else type(value)):
             expected = "list" if wanted is tuple else wanted.__name__
             raise ValueError(f"{name}: {parameter} is {value!r}, expected a {expected}")
     given = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items() if key in defaults}
     try:
-        part.make(kind(**given))
+        part.make(make_record(kind, given))
     except ValueError as error:
         raise ValueError(f"{name}: {error.args[0]}") from error

@@ -19,7 +19,6 @@ from quadvel_msgs.msg import ControllerState, LowState, VelocityCommand
 from quadvel_nodes.number_text import number_text
 from quadvel_nodes.topic_types import all_conflicts
 
-from .doctor import FILE_KEYS
 from .drive import twist_to_array, velocity_text
 from .exclusivity import ros_domain
 from .operator_commands import RECOVERY_HINT
@@ -38,6 +37,8 @@ STATUS_TOPICS = {
     "odom": Odometry,
     "velocity_estimate": TwistWithCovarianceStamped,
 }
+FILE_KEYS = ("actuator", "policy")
+"""Keys of /diagnostics with the files of a node."""
 RATES = ("low_state", "velocity_estimate", "controller/state", "command", "odom")
 LEVELS = {
     DiagnosticStatus.OK: "[green]ok",

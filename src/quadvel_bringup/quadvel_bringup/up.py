@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from .exclusivity import check_exclusive
+import quadvel_dds
+
+from .exclusivity import ensure_exclusive
 from .node_output import PrefixedOutput
-from .nodes import process_command
 from .page_watch import PageWatch
 from .preflight import check_stack
 from .processes import ProcessGroup, StopSignals
@@ -31,13 +32,13 @@ def up(stack: Stack, view: bool = False) -> int:
     check_stack(stack)
     if stack.brings_robot:
         check_exclusive()
-    nodes = stack.arguments(view)
+    nodes = stack.commands(view)
     say = PrefixedOutput(["quadvel", *nodes], Console(soft_wrap=True))
     with StopSignals() as signals, ProcessGroup(say) as group:
         say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them, `quadvel status` shows their health")
-        for name, arguments in nodes.items():
+        for name, command in nodes.items():
             if not signals.received:
-                group.start(name, process_command(name, arguments))
+                group.start(name, command)
         watch, ended = PageWatch(group, say), dict[str, int]()
         while not ended and not signals.wait(0.1):
             ended = watch.ended()
@@ -50,6 +51,15 @@ def up(stack: Stack, view: bool = False) -> int:
             if code and not (name == VIEW and watch.page_ended):
                 say("quadvel", f"{name} did not stop cleanly: exit code {code}")
     return 1 if any(codes.values()) else 0
+
+
+def check_exclusive() -> None:
+    """Run `ensure_exclusive` with a temporary node."""
+    quadvel_dds.install()
+    from .session import Session
+
+    with Session("look_for_others") as session:
+        ensure_exclusive(session.node)
 
 
 def _positive(code: int) -> int:

@@ -14,7 +14,7 @@ def version() -> str:
         Such as "0.1.0 (commit 873baba)"; with local changes "0.1.0 (commit 873baba, changed)".
     """
     try:
-        number = metadata.version("quadvel")
+        number = metadata.version("quadvel-core")
     except metadata.PackageNotFoundError:  # built by colcon, package by package
         number = metadata.version("quadvel_bringup")
     commit = _git("describe", "--always", "--exclude=*", "--dirty=, changed")

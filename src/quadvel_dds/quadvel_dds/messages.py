@@ -26,8 +26,8 @@ FORMATS = {
 }  # fmt: skip
 
 STORE = get_typestore(Stores.EMPTY)
-"""All definitions, with our classes in the place of those that rosbags would make."""
-STORE.register(definitions.STORE.fielddefs)
+"""All definitions; `message_class` adds our classes, where `register` would make one of each type."""
+STORE.fielddefs.update(definitions.STORE.fielddefs)
 
 
 def is_interface_package(package: str) -> bool:

@@ -13,8 +13,7 @@ from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 
-from google.protobuf.message import DecodeError, Message
-from onnx import ModelProto, TensorProto
+from .onnx_format import MAX_VALUES, FormatError, Message, TooManyValuesError, parse
 
 MAX_FILE_BYTES = 16_000_000
 """Ten times the shipped policy; a core reads this many bytes in a third of a 5 ms step."""
@@ -39,14 +38,15 @@ ALLOWED_PARTS = """
     GraphProto.value_info NodeProto.attribute NodeProto.metadata_props AttributeProto.t
     ValueInfoProto.type ValueInfoProto.metadata_props TypeProto.tensor_type TypeProto.Tensor.shape TensorShapeProto.dim
     """
-ALLOWED_TENSOR_TYPES = TensorProto.FLOAT, TensorProto.INT32, TensorProto.INT64, TensorProto.BOOL
+ALLOWED_TENSOR_TYPES = {1: "FLOAT", 6: "INT32", 7: "INT64", 9: "BOOL"}
+"""Numbers of TensorProto.data_type."""
 
 
 class NetworkFileError(ValueError):
     """A network file is missing, unreadable or of a wrong kind; the message names it."""
 
 
-def read_network(path: Path) -> ModelProto:
+def read_network(path: Path) -> Message:
     """Read a network from a file.
 
     Unknown fields of the format are discarded, so that a later reader sees only what was checked.
@@ -55,7 +55,7 @@ def read_network(path: Path) -> ModelProto:
         path: Path of an ONNX file.
 
     Returns:
-        The network.
+        The network, a "ModelProto".
 
     Raises:
         NetworkFileError: The file is missing or unreadable, or holds something that is not allowed.
@@ -71,8 +71,13 @@ def read_network(path: Path) -> ModelProto:
     if len(content) > MAX_FILE_BYTES:
         found, expected = (f"{length / 1e6:.1f} MB" for length in (size, MAX_FILE_BYTES))
         raise NetworkFileError(f"{path}: has {found}, expected at most {expected} to be run at 200 Hz")
-    model = _parse_model(content)
-    if model is None:
+    try:
+        model = parse(content)
+    except TooManyValuesError:
+        raise NetworkFileError(f"{path}: has more than {MAX_VALUES} values, expected fewer") from None
+    except FormatError:
+        model = None
+    if model is None or not model.one("ir_version"):  # every network has it; other parsable files do not
         start = content[:8]
         raise NetworkFileError(
             f"{path}: is not an ONNX network, or not a whole one: {size} bytes that begin with {start!r}"
@@ -82,63 +87,40 @@ def read_network(path: Path) -> ModelProto:
     return model
 
 
-def _parse_model(content: bytes) -> ModelProto | None:
-    """Return the network in the bytes of a file, or None if they are no network."""
-    model = ModelProto()
-    try:
-        model.ParseFromString(content)
-    except DecodeError:
-        return None
-    model.DiscardUnknownFields()
-    return model if model.ir_version else None  # every network has it; other parsable files do not
-
-
-def _find_problems(model: ModelProto) -> Iterator[str]:
+def _find_problems(model: Message) -> Iterator[str]:
     """Yield a sentence for everything that is not allowed."""
     operators, known = ALLOWED_OPERATORS.split(), ALLOWED_PARTS.split()
-    parts = list(islice(_iterate_parts(model), MAX_PARTS + 1))
+    parts = list(islice(model.parts(), MAX_PARTS + 1))
     if len(parts) > MAX_PARTS:
         yield f"has more than {MAX_PARTS} parts, expected fewer: so many operators are no step of 5 ms"
-    opsets = [(one.domain, one.version) for one in model.opset_import]
+    opsets = [(one.one("domain", ""), one.one("version", 0)) for one in model.all("opset_import")]
     if len(opsets) != 1 or opsets[0][0] != "" or opsets[0][1] not in SUPPORTED_OPSETS:
         found = ", ".join(f"{domain or 'ai.onnx'} {version}" for domain, version in opsets) or "none"
         yield f"operators come from the sets {found}, expected ai.onnx {SUPPORTED_OPSETS[0]} to {SUPPORTED_OPSETS[-1]} alone"
-    for node in model.graph.node:
-        if node.domain or node.op_type not in operators:
-            name = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
-            yield f"operator {name!r} of node {node.name!r} is not one of those that are run: {' '.join(operators)}"
     for place, part in parts:
-        if place not in known:
+        if place not in known or isinstance(part, bytes):
             yield f"has a part {place}, expected none: a network here is one graph of operators and plain tensors"
-        if not _has_utf8_text(part):
+        elif not part.is_readable():
             yield f"has a part {place} with a text that is not UTF-8, expected names that can be read"
-        if isinstance(part, TensorProto):
+        elif part.kind == "NodeProto":
+            domain, operator = part.one("domain", ""), part.one("op_type", "")
+            if domain or operator not in operators:
+                name = f"{domain}.{operator}" if domain else operator
+                yield (
+                    f"operator {name!r} of node {part.one('name', '')!r} is not one of those that are run: "
+                    + " ".join(operators)
+                )
+        elif part.kind == "TensorProto":
             yield from _find_tensor_problems(part)
 
 
-def _find_tensor_problems(tensor: TensorProto) -> Iterator[str]:
+def _find_tensor_problems(tensor: Message) -> Iterator[str]:
     """Yield a sentence for every property of a tensor that is not allowed."""
-    if tensor.data_location != TensorProto.DEFAULT:
-        yield f"tensor {tensor.name!r} lies in another file, expected all data in this one"
-    if tensor.data_type not in ALLOWED_TENSOR_TYPES:
-        expected = ", ".join(sorted(map(TensorProto.DataType.Name, ALLOWED_TENSOR_TYPES)))
-        yield f"tensor {tensor.name!r} is of type {tensor.data_type}, expected {expected}"
-    if min(tensor.dims, default=0) < 0 or math.prod(tensor.dims) > MAX_TENSOR_NUMBERS:
-        yield f"tensor {tensor.name!r} has the shape {list(tensor.dims)}, expected at most {MAX_TENSOR_NUMBERS} numbers"
-
-
-def _has_utf8_text(part: Message) -> bool:
-    """Return whether all texts of a part are UTF-8; protobuf returns other texts as bytes."""
-    texts = [value for field, value in part.ListFields() if field.type == field.TYPE_STRING]
-    return not any(
-        isinstance(one, bytes) for text in texts for one in ([text] if isinstance(text, bytes) else text)
-    )
-
-
-def _iterate_parts(whole: Message) -> Iterator[tuple[str, Message]]:
-    """Yield all nested messages, each with the name of its field in the format."""
-    for field, value in whole.ListFields():
-        if field.message_type is not None:
-            for part in [value] if isinstance(value, Message) else value:
-                yield field.full_name.removeprefix("onnx."), part
-                yield from _iterate_parts(part)
+    name, kind, dims = tensor.one("name", ""), tensor.one("data_type", 0), tensor.all("dims")
+    if tensor.one("data_location", 0):
+        yield f"tensor {name!r} lies in another file, expected all data in this one"
+    if kind not in ALLOWED_TENSOR_TYPES:
+        expected = ", ".join(sorted(ALLOWED_TENSOR_TYPES.values()))
+        yield f"tensor {name!r} is of type {kind}, expected {expected}"
+    if min(dims, default=0) < 0 or math.prod(dims) > MAX_TENSOR_NUMBERS:
+        yield f"tensor {name!r} has the shape {dims}, expected at most {MAX_TENSOR_NUMBERS} numbers"

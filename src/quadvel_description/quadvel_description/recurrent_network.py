@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
-from onnx import ModelProto
 
 from . import ahead
 from .network_file import NetworkFileError, read_network
+from .onnx_format import Message, serialise
 from .robot import JOINT_NAMES
 
 METADATA_KEY = "quadvel"
@@ -213,11 +213,11 @@ class RecurrentNetwork:
         if found != expected:
             raise self.mismatch_error(what, found, expected)
 
-    def _open_session(self, model: ModelProto) -> onnxruntime.InferenceSession:
+    def _open_session(self, model: Message) -> onnxruntime.InferenceSession:
         """Return a session of the network or of a part of it."""
         try:
             return onnxruntime.InferenceSession(
-                model.SerializeToString(), _session_options(), providers=["CPUExecutionProvider"]
+                serialise(model), _session_options(), providers=["CPUExecutionProvider"]
             )
         except Exception as error:  # onnxruntime's exceptions share no other base
             raise NetworkFileError(

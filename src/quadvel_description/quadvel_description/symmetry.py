@@ -44,7 +44,7 @@ def _signs(*signs: float) -> Mirror:
 
 JOINTS = Mirror(np.array([3 * leg + k for leg in _LEG_SWAP for k in range(3)]), np.tile([-1.0, 1.0, 1.0], 4))
 FEET = Mirror(np.array(_LEG_SWAP), np.ones(4))
-PARTS = {
+MIRRORS = {
     "command": _signs(1, -1, -1, 1),
     "roll_pitch": _signs(-1, 1),
     "q": JOINTS,
@@ -72,7 +72,7 @@ def concatenate_mirrors(parts: list[Mirror]) -> Mirror:
     )
 
 
-OBSERVATION = concatenate_mirrors(list(PARTS.values()))
+OBSERVATION = concatenate_mirrors(list(MIRRORS.values()))
 
 
 def mirror_observation(observation: np.ndarray) -> np.ndarray:

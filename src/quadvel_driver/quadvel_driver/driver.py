@@ -23,7 +23,7 @@ from std_srvs.srv import SetBool
 
 from quadvel_msgs.msg import LowCmd, LowState, MotorStatus
 from quadvel_msgs.srv import SetMode
-from quadvel_nodes.diagnostics import QUIET, diagnostics
+from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
 from quadvel_nodes.node import read_parameters, request_exit, run
 from quadvel_nodes.robot_view import RobotView
@@ -215,7 +215,7 @@ class Driver(Node):
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), bytes([level]), summary, values))
         self._reports += 1
         if level > Level.OK and self._reports > STARTUP_REPORTS:
-            self.get_logger().warning(summary, throttle_duration_sec=QUIET)
+            self.get_logger().warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
 
 
 def motor_status(stamp: Any, state: BoardState) -> Any:

@@ -25,7 +25,7 @@ from quadvel_description.frames import BASE, ODOM, Placed, footprint
 from quadvel_description.kinematics import rotate
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState
-from quadvel_nodes.diagnostics import QUIET, diagnostics
+from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transform_messages
@@ -185,7 +185,7 @@ class EstimatorNode(Node):
             level, summary = DiagnosticStatus.WARN, "no valid low_state in the last second"
         elif refused:
             level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
-            self.get_logger().warning(summary, throttle_duration_sec=QUIET)
+            self.get_logger().warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
         else:
             level, summary = DiagnosticStatus.OK, "estimating"
         values = {

@@ -1,4 +1,6 @@
-"""Benchmarks the speed of simulator, networks, transport and training (`quadvel bench`).
+"""Benchmarks the speed of simulator, networks and transport (`quadvel bench`).
+
+Other packages add parts by entry points of the group `quadvel.benchmarks`, each naming a `Benchmark`.
 
 One run measures everything, so that ratios hold where absolute figures vary between machines.
 Times are medians, which ignore interruptions by other programs.
@@ -10,23 +12,24 @@ import os
 import platform
 import time
 from collections.abc import Callable
-from importlib import metadata, util
+from importlib import metadata
 from typing import Any
 
+import attrs
 import numpy as np
 import onnxruntime
-from numpy.typing import ArrayLike
-from onnx import TensorProto, helper
 from rich.table import Table
 from typing_extensions import override
 
+from quadvel_description.onnx_format import float_value, message, serialise
 from quadvel_description.robot import NOMINAL_Q
-from quadvel_description.state import JointCommand, RobotState
+from quadvel_description.state import JointCommand
 from quadvel_driver import wire
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_nodes.number_text import number_text
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
+from quadvel_policy.tick_input import TickInput
 from quadvel_sim import Simulator, SimulatorConfig, World
 
 from . import round_trip
@@ -35,6 +38,21 @@ from .walk import Setup, make_loop, make_simulator
 
 WALK_COMMAND = (0.5, 0.0, 0.0)
 SCHEMA = 1
+GROUP = "quadvel.benchmarks"
+"""Entry points of other packages, each naming a `Benchmark`."""
+
+
+@attrs.frozen
+class Benchmark:
+    """One part of the benchmark.
+
+    Attributes:
+        measure: Function that returns the figures, or their absence as {"skipped": reason}.
+        rows: Rows of the table: name of the figure, description, target.
+    """
+
+    measure: Callable[[], dict[str, Any]]
+    rows: tuple[tuple[str, str, str], ...]
 
 
 def machine_info() -> dict[str, Any]:
@@ -159,11 +177,16 @@ def bench_policy() -> dict[str, Any]:
 
 def _idle_network() -> Callable[[], object]:
     """Return a function that runs the smallest network: the identity of one number."""
-    number = helper.make_tensor_value_info("x", TensorProto.FLOAT, [1])
-    same = helper.make_tensor_value_info("y", TensorProto.FLOAT, [1])
-    graph = helper.make_graph([helper.make_node("Identity", ["x"], ["y"])], "idle", [number], [same])
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    graph = message(
+        "GraphProto",
+        node=message("NodeProto", input="x", output="y", op_type="Identity"),
+        name="idle",
+        input=float_value("x", [1]),
+        output=float_value("y", [1]),
+    )
+    opset = message("OperatorSetIdProto", version=17)
+    model = message("ModelProto", ir_version=8, graph=graph, opset_import=opset)
+    session = onnxruntime.InferenceSession(serialise(model), providers=["CPUExecutionProvider"])
     x = {"x": np.zeros(1, np.float32)}
     return lambda: session.run(None, x)
 
@@ -206,11 +229,9 @@ class _TimedSupervisor(Supervisor):
         self.seconds: list[float] = []
 
     @override
-    def tick(
-        self, now: float, state: RobotState, velocity: ArrayLike | None, command: ArrayLike | None
-    ) -> JointCommand:
+    def tick(self, inputs: TickInput) -> JointCommand:
         start = time.perf_counter()
-        answer = super().tick(now, state, velocity, command)
+        answer = super().tick(inputs)
         self.seconds.append(time.perf_counter() - start)
         self.prepare()
         return answer
@@ -231,75 +252,99 @@ def bench_supervisor() -> dict[str, Any]:
     return _percentiles(timed.seconds)
 
 
-def _training(part: str) -> Callable[[], dict[str, Any]]:
-    """Return a benchmark of the training package, which is skipped without torch."""
-
-    def measure() -> dict[str, Any]:
-        if util.find_spec("torch") is None:
-            return {"skipped": "torch is not installed; pip install -e '.[train]'"}
-        from quadvel_training import bench
-
-        figures: dict[str, Any] = getattr(bench, part)()
-        return figures
-
-    return measure
-
-
-PARTS: dict[str, Callable[[], dict[str, Any]]] = {
-    "simulator": bench_simulator,
-    "world": bench_world,
-    "loop": bench_loop,
-    "policy": bench_policy,
-    "estimator": bench_estimator,
-    "supervisor": bench_supervisor,
-    "packets": bench_packets,
-    "round_trip": round_trip.measure_round_trips,
-    "environment": _training("environment"),
-    "training": _training("training"),
+PARTS: dict[str, Benchmark] = {
+    "simulator": Benchmark(
+        bench_simulator,
+        (
+            ("realtime_factor", "simulator alone, times real time", "15 or more"),
+            ("with_sensors_realtime_factor", "simulator with sensors at 200 Hz", ""),
+        ),
+    ),
+    "world": Benchmark(
+        bench_world,
+        (
+            ("realtime_factor", "simulator on the campus, times real time", ""),
+            ("scan_p50_us", "scan of 1080 rays on the campus, median, us", "5000 or less"),
+        ),
+    ),
+    "loop": Benchmark(
+        bench_loop,
+        (("realtime_factor", "evaluation loop, times real time", ""),),
+    ),
+    "policy": Benchmark(
+        bench_policy,
+        (
+            ("p50_us", "inference, observation to action, median, us", "50 or less"),
+            ("p99_us", "inference, observation to action, 99 %, us", ""),
+            ("ahead_p50_us", "inference, part done ahead, median, us", ""),
+            ("whole_p50_us", "inference, step in one piece, median, us", ""),
+            ("rested_p50_us", "inference after 5 ms of rest, median, us", ""),
+            ("rested_idle_p50_us", "smallest network after 5 ms of rest, us", ""),
+        ),
+    ),
+    "supervisor": Benchmark(
+        bench_supervisor,
+        (
+            ("p50_us", "supervisor tick, median, us", ""),
+            ("p99_us", "supervisor tick, 99 %, us", "1000 or less"),
+        ),
+    ),
+    "estimator": Benchmark(
+        bench_estimator,
+        (("p50_us", "learned estimator, median, us", ""),),
+    ),
+    "packets": Benchmark(
+        bench_packets,
+        (
+            ("encode_command_p50_us", "command to packet, median, us", "60 or less"),
+            ("decode_state_p50_us", "packet to state, median, us", "60 or less"),
+            ("encode_state_p50_us", "state to packet, median, us", "60 or less"),
+            ("decode_command_p50_us", "packet to command, median, us", "60 or less"),
+        ),
+    ),
+    "round_trip": Benchmark(
+        round_trip.measure_round_trips,
+        (
+            ("p50_us", "message round trip, median, us", ""),
+            ("p99_us", "message round trip, 99 %, us", ""),
+        ),
+    ),
 }
-TABLE_ROWS = (  # part, figure, description, target
-    ("simulator", "realtime_factor", "simulator alone, times real time", "15 or more"),
-    ("simulator", "with_sensors_realtime_factor", "simulator with sensors at 200 Hz", ""),
-    ("world", "realtime_factor", "simulator on the campus, times real time", ""),
-    ("world", "scan_p50_us", "scan of 1080 rays on the campus, median, us", "5000 or less"),
-    ("loop", "realtime_factor", "evaluation loop, times real time", ""),
-    ("policy", "p50_us", "inference, observation to action, median, us", "50 or less"),
-    ("policy", "p99_us", "inference, observation to action, 99 %, us", ""),
-    ("policy", "ahead_p50_us", "inference, part done ahead, median, us", ""),
-    ("policy", "whole_p50_us", "inference, step in one piece, median, us", ""),
-    ("policy", "rested_p50_us", "inference after 5 ms of rest, median, us", ""),
-    ("policy", "rested_idle_p50_us", "smallest network after 5 ms of rest, us", ""),
-    ("supervisor", "p50_us", "supervisor tick, median, us", ""),
-    ("supervisor", "p99_us", "supervisor tick, 99 %, us", "1000 or less"),
-    ("estimator", "p50_us", "learned estimator, median, us", ""),
-    ("packets", "encode_command_p50_us", "command to packet, median, us", "60 or less"),
-    ("packets", "decode_state_p50_us", "packet to state, median, us", "60 or less"),
-    ("packets", "encode_state_p50_us", "state to packet, median, us", "60 or less"),
-    ("packets", "decode_command_p50_us", "packet to command, median, us", "60 or less"),
-    ("round_trip", "p50_us", "message round trip, median, us", ""),
-    ("round_trip", "p99_us", "message round trip, 99 %, us", ""),
-    ("environment", "steps_per_s", "training environment, steps/s", ""),
-    ("environment", "ratio", "divided by that of the bare batch", "0.7 or more"),
-    ("training", "samples_per_s", "training, policy samples/s", ""),
-    ("training", "ratio", "divided by that of bare steps and passes", "0.6 or more"),
-    ("training", "physics_share", "share of training time: physics and actuators", ""),
-    ("training", "sensing_share", "share: observations and rewards", ""),
-    ("training", "inference_share", "share: inference", ""),
-    ("training", "learning_share", "share: learning", ""),
-)
+"""Benchmarks of this package, by part."""
 
 
-def benchmark_table(results: dict[str, dict[str, Any]]) -> Table:
+def all_parts() -> dict[str, Benchmark]:
+    """List PARTS and the benchmarks of other packages.
+
+    Returns:
+        Benchmarks by part; one that cannot be loaded reports why it is skipped.
+    """
+    return PARTS | {entry.name: _load(entry) for entry in metadata.entry_points(group=GROUP)}
+
+
+def _load(entry: metadata.EntryPoint) -> Benchmark:
+    """Load the benchmark that an entry point names."""
+    try:
+        benchmark: Benchmark = entry.load()
+    except ImportError as error:
+        skipped = {"skipped": f"{error.name} is not installed; pip install -e '.[train]'"}
+        return Benchmark(lambda: skipped, (("", entry.name, ""),))
+    return benchmark
+
+
+def benchmark_table(results: dict[str, dict[str, Any]], parts: dict[str, Benchmark]) -> Table:
     """Create a table of the figures and their targets.
 
     Args:
-        results: Results of PARTS, by part.
+        results: Results by part.
+        parts: The benchmarks.
 
     Returns:
         The table.
     """
     found = Table("figure", "measured", "target", title="Benchmark")
-    for part, figure, about, wanted in TABLE_ROWS:
+    for part, benchmark in parts.items():
         result = results[part]
-        found.add_row(about, result.get("skipped") or number_text(result[figure], ",.4g"), wanted)
+        for figure, about, wanted in benchmark.rows:
+            found.add_row(about, result.get("skipped") or number_text(result[figure], ",.4g"), wanted)
     return found

@@ -152,13 +152,13 @@ def bench_command(
     It takes some minutes. Run it on an idle machine.
     """
     output_file(out)
-    results = {}
+    parts, results = bench.all_parts(), {}
     messages = Console(stderr=True)
     with messages.status("") as status:
-        for name in bench.PARTS:
+        for name, part in parts.items():
             status.update(f"measuring: {name}")
-            results[name] = bench.PARTS[name]()
+            results[name] = part.measure()
     write_json(out, {"schema": bench.SCHEMA, "machine": bench.machine_info(), **results})
     console = Console()
-    console.print(bench.benchmark_table(results))
+    console.print(bench.benchmark_table(results, parts))
     console.print(f"written: {out}")

@@ -60,7 +60,9 @@ def _dask_cluster(address: str) -> Iterator[Callable[..., Any]]:
     try:
         from distributed import Client
     except ImportError:
-        raise ValueError("a cluster needs the package distributed: pip install 'quadvel[cluster]'") from None
+        raise ValueError(
+            "a cluster needs the package distributed: pip install 'quadvel-core[cluster]'"
+        ) from None
     with Client(address) as client:
         executor: Executor = client.get_executor(pure=False)
         yield executor.submit

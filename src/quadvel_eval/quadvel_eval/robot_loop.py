@@ -26,6 +26,7 @@ from quadvel_estimator.tracker import Estimator
 from quadvel_policy.command_mux import CommandMux, MuxInput
 from quadvel_policy.observation import RATE_HZ
 from quadvel_policy.supervisor import Supervisor
+from quadvel_policy.tick_input import TickInput
 from quadvel_sim.simulator import DT, Simulator, Truth
 
 CONTROL_PERIOD_S = 1.0 / RATE_HZ
@@ -125,7 +126,7 @@ class RobotLoop:
         self.simulator = simulator
         self.supervisor = supervisor
         self._estimator = estimator
-        self._beside = dict(shadow_estimators)
+        self._shadow_estimators = dict(shadow_estimators)
         self._mux = CommandMux([_PLANNER])
         self._velocity: Array | None = None
         self._previous_action = np.zeros(12)
@@ -144,10 +145,13 @@ class RobotLoop:
         """
         simulator = self.simulator
         now, state, truth, fallen = simulator.time, simulator.state(), simulator.truth(), simulator.fallen
-        estimates = {name: e.update(state, self._previous_action)[0] for name, e in self._beside.items()}
+        estimates = {
+            name: e.update(state, self._previous_action)[0] for name, e in self._shadow_estimators.items()
+        }
         self._mux.receive(_PLANNER.name, now, velocity)
         mux_output = self._mux.update(now)
-        command = self.supervisor.tick(now, state, self._velocity, [*mux_output.velocity, mux_output.stance])
+        commanded = [*mux_output.velocity, mux_output.stance]
+        command = self.supervisor.tick(TickInput(now, state, self._velocity, commanded))
         self._velocity, _ = self._estimator.update(state, self._previous_action)
         self._previous_action = previous_action(command.q, command.mode)
         simulator.command(command)

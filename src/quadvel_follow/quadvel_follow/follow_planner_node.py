@@ -14,7 +14,7 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
 from quadvel_msgs.msg import ControllerState, Persons
-from quadvel_nodes.diagnostics import QUIET, diagnostics
+from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, seconds
 from quadvel_nodes.node import read_parameters, run
 
@@ -123,7 +123,7 @@ class FollowPlannerNode(Node):
         summary = self._state_text or "starts"
         if refused:
             level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
-            self.get_logger().warning(summary, throttle_duration_sec=QUIET)
+            self.get_logger().warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
         values = {
             "state": self._plan.state.value if self._plan else "none",
             **self._refusals.diagnostic_values(),

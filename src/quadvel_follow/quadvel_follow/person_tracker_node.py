@@ -21,7 +21,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from quadvel_msgs.msg import Person, Persons
 from quadvel_msgs.srv import SelectPerson
-from quadvel_nodes.diagnostics import QUIET, diagnostics
+from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, seconds
 from quadvel_nodes.node import read_parameters, run
 
@@ -215,7 +215,7 @@ class PersonTrackerNode(Node):
         self._scan_count_before, self._refused_before = self._scan_count, self._refusals.total
         if refused:
             level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
-            self.get_logger().warning(summary, throttle_duration_sec=QUIET)
+            self.get_logger().warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
         elif used:
             level, summary = DiagnosticStatus.OK, "tracking"
         elif self._waiting:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from typing_extensions import override
 
 from quadvel_bringup.nodes import process_command, ros_arguments
 from quadvel_bringup.preflight import check_stack
@@ -34,6 +35,10 @@ FOLLOW_TOPICS = {
     "/scan": "sensor_msgs/msg/LaserScan",
 }
 """Topics and types that a following run records in addition."""
+
+
+MAX_WAIT_S = 120.0
+"""Time within which the robot has to start to follow."""
 
 
 class FollowedWalk(RecordedRun):
@@ -67,6 +72,7 @@ class FollowedWalk(RecordedRun):
             recording, {**stack.commands(view), **followers}, FOLLOW_TOPICS, False, console, seconds
         )
         self._seconds, self._began = seconds, float("inf")
+        self._created, self._last_state = time.monotonic(), "no state of the follow planner"
 
     def listen(self, node: Any) -> None:
         """Subscribe to the state of the follower.
@@ -89,8 +95,15 @@ class FollowedWalk(RecordedRun):
         """
         return not ended and time.monotonic() - self._began > self._seconds
 
+    @override
+    def failure(self) -> str:
+        if self._began < float("inf") or time.monotonic() - self._created < MAX_WAIT_S:
+            return ""
+        return f"the robot did not start to follow within {MAX_WAIT_S:.0f} s; last: {self._last_state}"
+
     def _on_state(self, message: Any) -> None:
         """Update the bar."""
+        self._last_state = message.data
         state, words = message.data.split(": ", maxsplit=1)
         if state == "following" and self._began == float("inf"):
             self._began = time.monotonic()

@@ -88,6 +88,14 @@ class RecordedRun(ABC):
             True if it ends in good order.
         """
 
+    def failure(self) -> str:
+        """Return why the run cannot complete although all nodes run, or "".
+
+        Returns:
+            One sentence, or "" as long as it can.
+        """
+        return ""
+
     def run(self) -> str:
         """Run to the end. RobotAlreadyRunningError passes through.
 
@@ -134,11 +142,11 @@ class RecordedRun(ABC):
 
     def _wait(self, group: ProcessGroup, signals: StopSignals, record: Callable[[], None]) -> str:
         """Record until the run is complete, or a node ended unexpectedly."""
-        watch, ended = PageWatch(group, self._output), dict[str, int]()
-        while not self.is_over(ended) and not ended and not signals.received:
+        watch, ended, failure = PageWatch(group, self._output), dict[str, int](), ""
+        while not (self.is_over(ended) or ended or failure or signals.received):
             record()
-            ended = watch.ended()
+            ended, failure = watch.ended(), self.failure()
         if self.is_over(ended):
             self._bar.update(self._task, completed=self._bar.tasks[0].total, description="done")
             return ""
-        return ", ".join(f"{name} ended with exit code {code}" for name, code in ended.items())
+        return failure or ", ".join(f"{name} ended with exit code {code}" for name, code in ended.items())

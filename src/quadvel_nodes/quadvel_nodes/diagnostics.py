@@ -7,7 +7,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-QUIET = 5.0
+LOG_THROTTLE_S = 5.0
 """s, shortest interval between two log lines about a lasting condition, such as refused messages.
 """
 

@@ -12,7 +12,6 @@ from types import FrameType
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
-import attrs
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock, ClockType
@@ -21,6 +20,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from .parameters import make_record, parameter_fields
 from .topic_types import CHECK_PERIOD_S, ConflictWatch
 
 Config = TypeVar("Config")
@@ -36,15 +36,16 @@ class StartError(ValueError):
 
 
 def read_parameters(node: Node, config: type[Config]) -> Config:
-    """Declare each field of an attrs class as a ROS parameter and return the values that were set.
+    """Declare the parameters of an attrs class at a node and return the values that were set.
 
     The default of a field is the default of its parameter and decides the type. The metadata
-    `description` of a field describes the parameter and its unit. Tuples become lists. Parameters
-    are read-only while the node runs.
+    `description` of a field describes the parameter and its unit. A field whose default is a record
+    stands for the fields of that one. Tuples become lists. Parameters are read-only while the node
+    runs.
 
     Args:
         node: The node that declares the parameters.
-        config: An attrs class; each field has the metadata `description`.
+        config: An attrs class, as for `parameter_fields`.
 
     Returns:
         An instance of `config`.
@@ -52,10 +53,9 @@ def read_parameters(node: Node, config: type[Config]) -> Config:
     Raises:
         StartError: A parameter is unknown, has the wrong type, or is rejected by the class.
     """
-    fields = attrs.fields(config)  # type: ignore[arg-type]
-    names = [field.name for field in fields]
+    fields = parameter_fields(config)
     values: dict[str, Any] = {}
-    for field in fields:
+    for field in fields.values():
         default = list(field.default) if isinstance(field.default, tuple) else field.default
         descriptor = ParameterDescriptor(description=field.metadata["description"], read_only=True)
         try:
@@ -65,9 +65,9 @@ def read_parameters(node: Node, config: type[Config]) -> Config:
         values[field.name] = tuple(value) if isinstance(field.default, tuple) else value
     for name in node._parameter_overrides:  # rclpy ignores undeclared parameters silently
         if not node.has_parameter(name) and not name.startswith("qos_overrides."):
-            raise StartError(f"unknown parameter {name}, expected one of {', '.join(names)}")
+            raise StartError(f"unknown parameter {name}, expected one of {', '.join(fields)}")
     try:
-        return config(**values)
+        return make_record(config, values)
     except ValueError as error:
         raise StartError(f"parameters: {error.args[0]}") from error
 

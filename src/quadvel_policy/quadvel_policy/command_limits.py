@@ -28,7 +28,7 @@ LIMITS = {
 """Condition of each limit by name, in the order in which they act."""
 
 
-@attrs.frozen(kw_only=True, slots=False)  # for multiple inheritance
+@attrs.frozen(kw_only=True)
 class JointCommandLimits:
     """Limits on joint commands besides those of the robot; each field is a node parameter."""
 

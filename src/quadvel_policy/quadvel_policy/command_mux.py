@@ -145,7 +145,7 @@ class CommandMux:
             The command; its stance is set once the velocity is zero.
         """
         # If the clock was set back, drop messages from the future: they would become fresh later.
-        self._received = {name: heard for name, heard in self._received.items() if heard[0] <= now}
+        self._received = {name: entry for name, entry in self._received.items() if entry[0] <= now}
         source = self._active_input(now)
         if source is None or self.locks or self.stance_requested:
             source, target = None, np.zeros(3)

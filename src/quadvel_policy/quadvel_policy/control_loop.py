@@ -24,17 +24,18 @@ from numpy.typing import ArrayLike
 from quadvel_description.arrays import Array
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_nodes.messages import MessageError
-from quadvel_nodes.scheduling import Scheduling
 from quadvel_nodes.stall_free_clock import StallFreeClock
 from quadvel_nodes.tick_grid import TickGrid
 
+from .config import SupervisorConfig
 from .guard import FALL_TIME_S
 from .loop_stats import LoopStats
 from .observation import RATE_HZ
 from .received import StampCheck
 from .settings import setting
 from .stall_detector import StallDetector
-from .supervisor import Supervisor, SupervisorConfig
+from .supervisor import Supervisor
+from .tick_input import TickInput
 
 PERIOD_S = 1.0 / RATE_HZ
 WATCH_PERIOD_S = 0.02
@@ -56,9 +57,10 @@ Stamped = tuple[float, Array]
 
 
 @attrs.frozen(kw_only=True)
-class ControlConfig(SupervisorConfig, Scheduling):
-    """Parameters of supervisor and scheduling, and age limits of the inputs; each field is a node parameter."""
+class ControlConfig:
+    """Parameters of the supervisor, and age limits of its inputs; each is a node parameter."""
 
+    supervisor: SupervisorConfig = SupervisorConfig()
     max_velocity_age: float = setting(
         0.05,
         "oldest velocity estimate that is used; after that the Kalman filter replaces it, s",
@@ -109,7 +111,7 @@ class ControlLoop:
         supervisor: The supervisor.
         stats: Timing statistics.
         stall_detector: Detector of stalls of this process.
-        state: The newest state that was answered; None before the first.
+        inputs: Inputs of the newest tick; the caller sets `motors` and `duplicate_publisher`.
     """
 
     def __init__(
@@ -125,7 +127,7 @@ class ControlLoop:
 
         Args:
             supervisor: The supervisor.
-            config: Its parameters and the age limits.
+            config: Parameters of the supervisor and age limits.
             answer: Called with each joint command.
             clock: Clock of the stamps, s.
             sim_time: Whether that clock is a simulator's in lockstep, which waits for the answer to
@@ -136,24 +138,25 @@ class ControlLoop:
         self.supervisor = supervisor
         self.stats = LoopStats()
         self.stall_detector = StallDetector(WATCH_PERIOD_S, PERIOD_S)
-        self.state: RobotState | None = None
+        self.inputs = TickInput()
+        self._guards = config.supervisor.guards
         self._config, self._publish, self._sim_time = config, answer, sim_time
         self._clock, self._steady = clock, steady or clock
         self._clock_offset = self._clock() - self._steady()
         self._velocity_lead = (
-            math.inf if config.robot_waits else 0.0
+            math.inf if self._guards.robot_waits else 0.0
         )  # s, by which a velocity may be ahead of the state during a stall
         self._robot_time, self._grid = StallFreeClock(), TickGrid(PERIOD_S)
         self._waiting_state: RobotState | None = None  # the state that waits for estimator or mux
-        patience = LOCKSTEP_WAIT_S if sim_time else MAX_STALL_S
-        self._estimator = _LaggingNode(1.5 * PERIOD_S, patience)
-        self._mux = _LaggingNode(0.5 * config.command_timeout if sim_time else math.inf, patience)
+        max_wait = LOCKSTEP_WAIT_S if sim_time else MAX_STALL_S
+        self._estimator = _LaggingNode(1.5 * PERIOD_S, max_wait)
+        self._mux = _LaggingNode(0.5 * config.command_timeout if sim_time else math.inf, max_wait)
         self._answer = JointCommand.damping()
         self._velocity: Stamped | None = None
         self._command: Stamped | None = None
         self._checks = {
-            "low_state": StampCheck(config.silence_limit),
-            "waiting": StampCheck(config.silence_limit),
+            "low_state": StampCheck(self._guards.silence_limit),
+            "waiting": StampCheck(self._guards.silence_limit),
             "velocity_estimate": StampCheck(config.max_velocity_age + self._velocity_lead),
             "command": StampCheck(config.command_timeout),
         }
@@ -175,9 +178,9 @@ class ControlLoop:
         start = time.perf_counter()
         now = self._accept("low_state", state.time)
         self.stall_detector.poll(now)
-        longest = max(MAX_STALL_S if self.stall_detector.has_stalled else 0.0, self._config.silence_limit)
+        longest = max(MAX_STALL_S if self.stall_detector.has_stalled else 0.0, self._guards.silence_limit)
         state.time = self._robot_time.update(state.time, state.tick, longest)
-        self.supervisor.stopped += self.stall_detector.stalled_s
+        self.inputs.stopped += self.stall_detector.stalled_s
         self.stall_detector.on_message()
         if self._outruns_others(state):
             self._waiting_state = state
@@ -195,7 +198,7 @@ class ControlLoop:
             MessageError: The stamp is invalid.
         """
         now = self._accept("waiting", stamp)
-        if self.state is not None and tick == self._robot_time.tick:
+        if self.inputs.state is not None and tick == self._robot_time.tick:
             self._robot_time.update(stamp, tick, is_waiting=True)
         self._resume(now)
 
@@ -239,19 +242,20 @@ class ControlLoop:
             topic: Topic of the message.
             why: The reason.
         """
-        if type(why) is not MessageError or topic not in self.supervisor.refused:
-            self.supervisor.refused[topic] = why
+        if type(why) is not MessageError or topic not in self.inputs.refused:
+            self.inputs.refused[topic] = why
 
     def watch(self) -> None:
         """Run the supervisor if no valid state comes; to be called every WATCH_PERIOD_S."""
         now = self._now()
         self.stall_detector.poll(now)
-        if self.state is None:
+        state = self.inputs.state
+        if state is None:
             return
-        refused = "low_state" in self.supervisor.refused
-        limit = self._config.max_state_age if refused else self._config.silence_limit
-        if now - self.stalled - self.state.time > limit and not self.stall_detector.excuses_silence(now):
-            self._tick(self.state, now)
+        refused = "low_state" in self.inputs.refused
+        limit = self._guards.max_state_age if refused else self._guards.silence_limit
+        if now - self.stalled - state.time > limit and not self.stall_detector.excuses_silence(now):
+            self._tick(state, now)
 
     def _now(self, stamp: float = 0.0) -> float:
         """Return the clock of the stamps, s, at least `stamp` in simulated time, which may arrive late."""
@@ -268,12 +272,12 @@ class ControlLoop:
     def _accept(self, topic: str, stamp: float) -> float:
         now = self._now(stamp)
         self._checks[topic].check(stamp, now)
-        self.supervisor.refused.pop(topic, None)
+        self.inputs.refused.pop(topic, None)
         return now
 
     def _outruns_others(self, state: RobotState) -> bool:
         """Return whether the simulator must wait for the estimator, or in lockstep for the mux."""
-        if not (self._sim_time or self._config.robot_waits):
+        if not (self._sim_time or self._guards.robot_waits):
             return False
         now = time.monotonic()
         known = ((self._velocity, self._estimator), (self._command, self._mux))
@@ -295,15 +299,15 @@ class ControlLoop:
 
     def _tick(self, state: RobotState, now: float) -> None:
         """Run one tick with the inputs known at `now` (s) and publish the command."""
-        self.supervisor.overruns = 0 if self._config.robot_waits else self.stats.consecutive_overruns
-        self.state = state
-        now -= self.stalled
-        velocity = _value_if_fresh(
-            self._velocity, state.time, self._config.max_velocity_age, self._velocity_lead
+        inputs, config = self.inputs, self._config
+        inputs.now, inputs.state = now - self.stalled, state
+        inputs.velocity = _value_if_fresh(
+            self._velocity, state.time, config.max_velocity_age, self._velocity_lead
         )
-        command = _value_if_fresh(self._command, now, self._config.command_timeout)
-        self._answer = self.supervisor.tick(now, state, velocity, command)
-        self.supervisor.stopped = 0.0
+        inputs.command = _value_if_fresh(self._command, inputs.now, config.command_timeout)
+        inputs.overruns = 0 if self._guards.robot_waits else self.stats.consecutive_overruns
+        self._answer = self.supervisor.tick(inputs)
+        inputs.stopped = 0.0
         self._publish(self._answer)
 
     def _resume(self, now: float) -> None:

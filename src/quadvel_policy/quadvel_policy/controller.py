@@ -22,18 +22,20 @@ from quadvel_description.state import JointCommand
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand, Waiting
 from quadvel_msgs.srv import SetMode
-from quadvel_nodes.diagnostics import QUIET, diagnostics
+from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state, seconds, write_low_cmd
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.number_text import number_text
+from quadvel_nodes.scheduling import Scheduling
 
 from .control_loop import WATCH_PERIOD_S, ControlConfig, ControlLoop
-from .guard import MotorStatus as Motors
 from .operator_log import OperatorLog
 from .policy_file import SHIPPED_POLICY, PolicyFile
 from .received import linear_velocity, planar_velocity
 from .settings import setting
-from .supervisor import MODES, Supervisor
+from .supervisor import Supervisor
+from .tick_input import MotorStatus as Motors
+from .transitions import MODES
 
 # Only the newest state is useful.
 LATEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
@@ -44,9 +46,11 @@ where time stands still then, a robot that reported before counts as lost.
 
 
 @attrs.frozen(kw_only=True)
-class ControllerParameters(ControlConfig):
-    """Parameters of the loop and of the node; each field is a node parameter."""
+class ControllerParameters:
+    """Parameters of the node and of its parts."""
 
+    scheduling: Scheduling = Scheduling()
+    control: ControlConfig = ControlConfig()
     policy: str = setting("", "ONNX file of the policy; empty: the one that is shipped")
 
 
@@ -58,11 +62,11 @@ class Controller(Node):
         self._settings = read_parameters(self, ControllerParameters)
         policy = PolicyFile(self._settings.policy or SHIPPED_POLICY)
         policy.prepare()  # the first run is slow
-        self._supervisor = Supervisor(policy, self._settings, KalmanEstimator())
+        self._supervisor = Supervisor(policy, self._settings.control.supervisor, KalmanEstimator())
         self._sim_time: bool = self.get_parameter("use_sim_time").value
         self._loop = ControlLoop(
             self._supervisor,
-            self._settings,
+            self._settings.control,
             self._publish,
             self._now,
             self._sim_time,
@@ -74,7 +78,7 @@ class Controller(Node):
         self._reports = self._silent_reports = 0  # total, and since the last low_state
         self._create_interfaces()
         if not self._sim_time:  # simulated time waits for the node, so it needs no priority
-            self._settings.apply(self.get_logger().warning)
+            self._settings.scheduling.apply(self.get_logger().warning)
         gc.freeze()  # exclude existing objects from garbage collection, which would delay a tick
 
     def _create_interfaces(self) -> None:
@@ -82,10 +86,10 @@ class Controller(Node):
         self._controller_state = self.create_publisher(ControllerState, "controller/state", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # Best effort suits a robot's driver; a simulator in lockstep waits for the answer to each state.
-        of_states = (
+        state_qos = (
             LATEST_QOS if self._sim_time else QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         )
-        self._states = self.create_subscription(LowState, "low_state", self._on_state, of_states)
+        self._states = self.create_subscription(LowState, "low_state", self._on_state, state_qos)
         self.create_subscription(Waiting, "waiting", self._on_waiting, LATEST_QOS)
         self.create_subscription(
             TwistWithCovarianceStamped, "velocity_estimate", self._on_velocity, LATEST_QOS
@@ -137,7 +141,7 @@ class Controller(Node):
         except MessageError as error:
             self._refusals.add("motor_status", error)
             return
-        self._supervisor.motors = Motors(temperature, np.array(message.dropped_out, bool))
+        self._loop.inputs.motors = Motors(temperature, np.array(message.dropped_out, bool))
 
     def _publish(self, answer: JointCommand) -> None:
         self._message.stamp = self.get_clock().now().to_msg()
@@ -192,9 +196,9 @@ class Controller(Node):
 
     def _report(self) -> None:
         """Publish /diagnostics and check for a second publisher of states, at 1 Hz."""
-        self._supervisor.duplicate_publisher = self._duplicate_publisher()
+        self._loop.inputs.duplicate_publisher = self._duplicate_publisher()
         self._silent_reports += 1
-        if self._sim_time and self._loop.state is not None and self._silent_reports > SILENCE_LIMIT_S:
+        if self._sim_time and self._loop.inputs.state is not None and self._silent_reports > SILENCE_LIMIT_S:
             self._supervisor.fail(
                 f"no state came for {SILENCE_LIMIT_S} s: the simulator is silent", "state_stale"
             )
@@ -222,15 +226,15 @@ class Controller(Node):
         self._reports += 1
         for sentence in self._operator_log.walk_refusals():
             log.info(sentence)
-        if self._supervisor.duplicate_publisher:
-            log.error(self._supervisor.duplicate_publisher, throttle_duration_sec=QUIET)
-        elif self._loop.state is None:
+        if self._loop.inputs.duplicate_publisher:
+            log.error(self._loop.inputs.duplicate_publisher, throttle_duration_sec=LOG_THROTTLE_S)
+        elif self._loop.inputs.state is None:
             if self._reports == SILENCE_LIMIT_S:
                 log.warning(
                     f"{self._missing_state_text()} in {SILENCE_LIMIT_S} s: is a simulator or a driver running?"
                 )
         elif level == DiagnosticStatus.WARN:
-            log.warning(summary, throttle_duration_sec=QUIET)
+            log.warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
 
     def _duplicate_publisher(self) -> str | None:
         """Return a sentence if more than one node publishes states, which fit no single robot, else None."""
@@ -240,7 +244,7 @@ class Controller(Node):
         )
 
     def _missing_state_text(self) -> str:
-        refusal = self._supervisor.refused.get("low_state")
+        refusal = self._loop.inputs.refused.get("low_state")
         return f"no valid message on low_state ({refusal})" if refusal else "no message on low_state"
 
     def _status(self) -> tuple[bytes, str]:
@@ -253,9 +257,9 @@ class Controller(Node):
         status = f"{self._supervisor.mode}: {self._supervisor.reason}"
         if self._supervisor.fault:
             return DiagnosticStatus.ERROR, status
-        if self._supervisor.duplicate_publisher:
-            return DiagnosticStatus.ERROR, self._supervisor.duplicate_publisher
-        if self._loop.state is None:
+        if self._loop.inputs.duplicate_publisher:
+            return DiagnosticStatus.ERROR, self._loop.inputs.duplicate_publisher
+        if self._loop.inputs.state is None:
             return DiagnosticStatus.WARN, f"{self._missing_state_text()} yet"
         if self._supervisor.findings:
             return DiagnosticStatus.WARN, f"{self._supervisor.findings[0].sentence}; {status}"

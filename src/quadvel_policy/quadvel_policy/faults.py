@@ -7,10 +7,13 @@ from collections.abc import Iterator
 
 import attrs
 
+from quadvel_nodes.parameters import parameter_fields
+
 from .command_limits import LIMITS
+from .config import SupervisorConfig
 from .guard import MOVING_MODES, Level
 from .guards import GUARDS
-from .supervisor import SUPERVISOR_FAULTS, SupervisorConfig
+from .supervisor import SUPERVISOR_FAULTS
 
 RESPONSES = {
     Level.DAMPING: "all joints brake immediately",
@@ -81,7 +84,7 @@ def table() -> list[Row]:
             for guard in GUARDS
         ),
         *(Row(name, *fields) for name, fields in SUPERVISOR_FAULTS.items()),
-        *(Row(name, Level.LIMIT, MOVING_MODES, notices) for name, notices in LIMITS.items()),
+        *(Row(name, Level.LIMIT, MOVING_MODES, condition) for name, condition in LIMITS.items()),
     ]
 
 
@@ -117,7 +120,7 @@ def _add_defaults(text: str) -> str:
 
 
 def _parameter_defaults() -> Iterator[tuple[str, str]]:
-    for field in attrs.fields(SupervisorConfig):
+    for field in parameter_fields(SupervisorConfig).values():
         *_, unit = field.metadata["description"].rpartition(", ")
         yield (
             field.name,

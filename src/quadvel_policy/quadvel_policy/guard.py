@@ -14,12 +14,13 @@ from functools import cached_property
 import attrs
 import numpy as np
 
-from quadvel_description.arrays import Array, Bools
+from quadvel_description.arrays import Array
 from quadvel_description.robot import LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_nodes.messages import MessageError
 
 from .settings import setting
+from .tick_input import MotorStatus
 
 MOVING_MODES = ("stand_up", "stance", "walk", "lie_down")
 """Modes in which the joints do more than brake."""
@@ -115,22 +116,9 @@ class GuardConfig:
         return self.max_standstill if self.robot_waits else self.max_state_age
 
 
-@attrs.frozen
-class MotorStatus:
-    """Slow status of the motors, as the board reports it.
-
-    Attributes:
-        temperature: Motor temperatures, (12,), deg C.
-        dropped_out: Whether the board has switched the motor off, (12,).
-    """
-
-    temperature: Array
-    dropped_out: Bools
-
-
 @attrs.define
 class GuardInput:
-    """Input of the guards at one tick.
+    """Input of the guards at one tick: the outer inputs (`TickInput`) and what the supervisor knows.
 
     Attributes:
         config: Limits.
@@ -164,8 +152,8 @@ class GuardInput:
     overruns: int
     motors: MotorStatus | None
     duplicate_publisher: str | None
-    refused: Mapping[str, MessageError] = attrs.field(factory=dict)
-    stopped: float = 0.0
+    refused: Mapping[str, MessageError]
+    stopped: float
 
     @cached_property
     def is_sound(self) -> bool:

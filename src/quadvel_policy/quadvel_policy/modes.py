@@ -74,18 +74,18 @@ class ModeInput:
 class Mode(Protocol):
     """Interface of a mode."""
 
-    def enter(self, tick: ModeInput) -> None:
+    def enter(self, inputs: ModeInput) -> None:
         """Initialise the mode.
 
         Args:
-            tick: The first input.
+            inputs: The first input.
         """
 
-    def tick(self, tick: ModeInput) -> JointCommand:
+    def tick(self, inputs: ModeInput) -> JointCommand:
         """Compute the joint command of one tick.
 
         Args:
-            tick: The input.
+            inputs: The input.
 
         Returns:
             The joint command.
@@ -130,18 +130,18 @@ class Damping:
         """
         self._kd = kd
 
-    def enter(self, tick: ModeInput) -> None:
+    def enter(self, inputs: ModeInput) -> None:
         """Do nothing.
 
         Args:
-            tick: Not used.
+            inputs: Not used.
         """
 
-    def tick(self, tick: ModeInput) -> JointCommand:
+    def tick(self, inputs: ModeInput) -> JointCommand:
         """Return the damping command.
 
         Args:
-            tick: Not used.
+            inputs: Not used.
 
         Returns:
             The joint command.
@@ -212,37 +212,37 @@ class Posture:
         """
         return bool(elapsed >= self._times[-1])
 
-    def enter(self, tick: ModeInput) -> None:
+    def enter(self, inputs: ModeInput) -> None:
         """Set the start of the path from the measured joints and the previous command.
 
             q_0 = q + (kp_prev (q_des,prev - q) + tau_ff,prev) / kp
 
         Args:
-            tick: The first input.
+            inputs: The first input.
         """
-        measured, requested = tick.state.q, tick.previous
+        measured, requested = inputs.state.q, inputs.previous
         self._postures[0] = measured + (requested.kp * (requested.q - measured) + requested.tau) / self._kp
-        self._lean, self._lean_updated_at = vertical_offset(tick.state), tick.elapsed
+        self._lean, self._lean_updated_at = vertical_offset(inputs.state), inputs.elapsed
 
-    def tick(self, tick: ModeInput) -> JointCommand:
+    def tick(self, inputs: ModeInput) -> JointCommand:
         """Return the posture on the path at this time.
 
         The tilt is low-pass filtered: lean' = lean + (1 - exp(-dt / LEAN_FILTER_S)) (offset -
         lean).
 
         Args:
-            tick: The input.
+            inputs: The input.
 
         Returns:
             The joint command.
         """
-        share = 1.0 - math.exp(-max(tick.elapsed - self._lean_updated_at, 0.0) / LEAN_FILTER_S)
+        share = 1.0 - math.exp(-max(inputs.elapsed - self._lean_updated_at, 0.0) / LEAN_FILTER_S)
         self._lean, self._lean_updated_at = (
-            self._lean + share * (vertical_offset(tick.state) - self._lean),
-            tick.elapsed,
+            self._lean + share * (vertical_offset(inputs.state) - self._lean),
+            inputs.elapsed,
         )
         self._postures[1:] = self._lean_postures(self._lean)
-        q, dq = self._interpolate(tick.elapsed)
+        q, dq = self._interpolate(inputs.elapsed)
         return JointCommand(q=q, dq=dq, kp=self._kp, kd=self._kd)
 
     def _lean_postures(self, lean: Array) -> Array:
@@ -300,20 +300,20 @@ class Walk:
         """Compute the part of the next step that needs no observation."""
         self._policy.prepare()
 
-    def enter(self, tick: ModeInput) -> None:
+    def enter(self, inputs: ModeInput) -> None:
         """Reset the policy and keep the previous command for the fade-in.
 
         Args:
-            tick: The first input.
+            inputs: The first input.
         """
         self.reset()
-        self._fade_from = tick.previous
+        self._fade_from = inputs.previous
 
-    def tick(self, tick: ModeInput) -> JointCommand:
+    def tick(self, inputs: ModeInput) -> JointCommand:
         """Run one step of the policy.
 
         Args:
-            tick: The input, with a velocity.
+            inputs: The input, with a velocity.
 
         Returns:
             The joint command.
@@ -321,21 +321,21 @@ class Walk:
         Raises:
             FloatingPointError: The output of the policy is not finite.
         """
-        assert tick.velocity is not None  # the supervisor does not walk without one
+        assert inputs.velocity is not None  # the supervisor does not walk without one
         observation = build_observation(
             self._observation,
-            command=tick.command,
-            quaternion=tick.state.quaternion,
-            q=tick.state.q,
-            dq=tick.state.dq,
-            linear_velocity=tick.velocity,
-            angular_velocity=tick.state.angular_velocity,
+            command=inputs.command,
+            quaternion=inputs.state.quaternion,
+            q=inputs.state.q,
+            dq=inputs.state.dq,
+            linear_velocity=inputs.velocity,
+            angular_velocity=inputs.state.angular_velocity,
             previous_action=self._previous_action,
         )
         start = time.perf_counter()
         self._previous_action = self._policy.step(observation)
         self.inference_seconds = time.perf_counter() - start
         requested = JointCommand(q=self._action.targets(self._previous_action), kp=self._kp, kd=self._kd)
-        if tick.elapsed < self._blend_time:
-            return blend(self._fade_from, requested, tick.elapsed / self._blend_time)
+        if inputs.elapsed < self._blend_time:
+            return blend(self._fade_from, requested, inputs.elapsed / self._blend_time)
         return requested

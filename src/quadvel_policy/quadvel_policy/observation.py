@@ -256,7 +256,7 @@ class PolicyMetadata:
         rate_hz: Rate of the policy, Hz.
         observation: Terms of the observation.
         command_limits: Commands of the training, (low, high) of vx, vy (m/s) and wz (rad/s).
-        curve_limit: Largest lateral acceleration in curves, m/s^2, see `CommandLimits`; None if the
+        curve_limit: Largest lateral acceleration in curves, m/s^2, see `VelocityCommandLimits`; None if the
             limits of the axes are independent.
         state_shape: Shape of h_in and of c_in.
         actuator: Actuator model of the training, as JSON.
@@ -294,10 +294,10 @@ class PolicyMetadata:
         return ActionMap(self.action_offset, self.action_scale, self.action_clip)
 
     @property
-    def limits(self) -> CommandLimits:
+    def limits(self) -> VelocityCommandLimits:
         """Velocity commands that the policy can follow."""
         vx, vy, wz = (self.command_limits[axis] for axis in COMMAND_AXES)
-        return CommandLimits((vx[0], vy[0], wz[0]), (vx[1], vy[1], wz[1]), self.curve_limit)
+        return VelocityCommandLimits((vx[0], vy[0], wz[0]), (vx[1], vy[1], wz[1]), self.curve_limit)
 
     def to_json(self) -> str:
         """Return the JSON object of the policy file.
@@ -358,7 +358,7 @@ REQUIRED_FIELDS = tuple(field for field in METADATA_FIELDS if field != "curve_li
 
 
 @attrs.frozen
-class CommandLimits:
+class VelocityCommandLimits:
     """Limits of velocity commands (vx, vy, wz), m/s and rad/s; coupled if `curve` is given.
 
     With `curve`, vx and vy stay in the ellipse of their limits, at the normalised radius r, and

@@ -7,7 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 
 from .guard import Level
-from .supervisor import VELOCITY_MODES, Supervisor
+from .supervisor import Supervisor
+from .transitions import VELOCITY_MODES
 
 REPEAT_AFTER_S = 5.0
 """s without a finding before the same finding is logged again."""

@@ -50,10 +50,11 @@ def _load_store() -> Any:
     The type store of rosbags has no services, so request and response are parsed as messages.
     """
     store, own_files = get_typestore(Stores.ROS2_JAZZY), _own_definitions()
+    types: dict[str, Any] = {}
     for file in sorted(own_files.glob("msg/*.msg")):
-        store.register(get_types_from_msg(file.read_text(), f"{OWN_PACKAGE}/msg/{file.stem}"))
+        types.update(get_types_from_msg(file.read_text(), f"{OWN_PACKAGE}/msg/{file.stem}"))
     for name, text in unitree_go.DEFINITIONS.items():
-        store.register(get_types_from_msg(text, f"unitree_go/msg/{name}"))
+        types.update(get_types_from_msg(text, f"unitree_go/msg/{name}"))
     own = {f"{OWN_PACKAGE}/srv/{file.stem}": file.read_text() for file in sorted(own_files.glob("srv/*.srv"))}
     for name, text in {**SERVICE_DEFINITIONS, **own}.items():
         package, _, short = name.split("/")
@@ -61,7 +62,8 @@ def _load_store() -> Any:
         request, _, response = f"\n{text}\n".partition("\n---\n")
         for part, definition in {"Request": request, "Response": response}.items():
             (parsed,) = get_types_from_msg(definition, f"{package}/msg/{short}").values()
-            store.register({f"{name}_{part}": parsed})
+            types[f"{name}_{part}"] = parsed
+    store.register(types)  # once: each call compiles code
     return store
 
 

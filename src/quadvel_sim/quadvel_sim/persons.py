@@ -15,7 +15,8 @@ import numpy as np
 from quadvel_description.arrays import Array
 from quadvel_sim.laser import LASER_VISIBLE_GROUP
 from quadvel_sim.walker import Walker
-from quadvel_sim.world import Person, World
+from quadvel_sim.world import World
+from quadvel_sim.world_parts import Person
 
 UPDATE_PERIOD_MS = 10
 """Simulated time between two positions of a person."""

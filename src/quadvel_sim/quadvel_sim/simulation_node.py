@@ -25,7 +25,7 @@ from visualization_msgs.msg import Marker
 from quadvel_description.frames import BASE, ODOM, Placed
 from quadvel_description.state import RobotState
 from quadvel_msgs.srv import Push, ResetSim, StepSim
-from quadvel_nodes.diagnostics import QUIET, diagnostics
+from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.node import read_parameters, request_exit
 from quadvel_nodes.robot_view import LATCHED, fill_quaternion, fill_vector, transform_messages
 from quadvel_nodes.system_time import SystemTime, as_time
@@ -265,7 +265,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
         if warning:
-            self.get_logger().warning(warning, throttle_duration_sec=QUIET)
+            self.get_logger().warning(warning, throttle_duration_sec=LOG_THROTTLE_S)
         if slow := self._slowness.next_line(monotonic(), report.given_up):
             self.get_logger().warning(slow)
         if report.fallen and not self._has_fallen:

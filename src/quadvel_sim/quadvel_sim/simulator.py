@@ -30,13 +30,14 @@ from quadvel_sim import persons
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.laser import Scan
 from quadvel_sim.surroundings import Surroundings, is_ground
-from quadvel_sim.world import SURFACE_PRIORITY
+from quadvel_sim.world_parts import SURFACE_PRIORITY
 
 __all__ = ["DT", "SensorNoise", "Simulator", "SimulatorConfig", "Truth"]
 
 DT = 0.001
 """Time step, s."""
 _TICK_MODULUS = 2**32
+_JAM_TORQUE = 500.0  # N m, friction of a jammed joint
 _PAYLOAD_RADIUS_M = 0.05  # the payload is a solid sphere: I = 2/5 m r^2
 _Array = Array
 # q, kp, kd, dq, tau: arguments of ActuatorModel.step
@@ -167,6 +168,7 @@ class Simulator:
         world = self.config.world
         self._surroundings = None if world is None else Surroundings(self.model, world)
         self._noise = np.repeat(attrs.astuple(self.config.noise), (12, 12, 3, 3, 3))
+        self._joint_friction = self.model.dof_frictionloss.copy()
         self.reset()
 
     def reset(self, keyframe: str = "lie", seed: int | None = None) -> None:
@@ -193,6 +195,8 @@ class Simulator:
             self.data.qpos[3:7] = tilt
         if self._surroundings is not None:
             self._surroundings.reset(self.data, seed)
+        self.model.dof_frictionloss[:] = self._joint_friction
+        self._failed_joints: list[int] = []
         self._pushes: list[_Push] = []
         self.steps = 0
         self._is_derived_current = False
@@ -270,9 +274,11 @@ class Simulator:
         """
         model, data, q, dq = self.model, self.data, self._q, self._dq
         torque, answer, more = data.ctrl, self.actuator.step, self.config.physics.substeps - 1
-        surroundings = self._surroundings
+        surroundings, failed = self._surroundings, self._failed_joints
         for _ in range(n):
             torque[:] = answer(q, dq, *self._active_command)
+            if failed:
+                torque[failed] = 0.0
             if self._is_derived_current:  # mj_step1 is done: only the second half of the step remains
                 mujoco.mj_step2(model, data)
                 self._is_derived_current = False
@@ -316,6 +322,29 @@ class Simulator:
             raise ValueError(f"push: duration: found {duration} s, expected at least {DT} s")
         self._pushes.append(_Push(self.model.body(body).id, wrench, max(1, round(duration / DT))))
         self._apply_pushes()
+
+    def fail_joint(self, name: str) -> None:
+        """Switch off a drive until the next reset: its torque, also the measured one, is zero.
+
+        Args:
+            name: Name of the joint.
+
+        Raises:
+            ValueError: The joint is unknown.
+        """
+        self._failed_joints += robot.joint_index([name])
+
+    def jam_joint(self, name: str) -> None:
+        """Jam a joint by friction until the next reset; as MuJoCo's friction is soft, it still creeps.
+
+        Args:
+            name: Name of the joint.
+
+        Raises:
+            ValueError: The joint is unknown.
+        """
+        (joint,) = robot.joint_index([name])
+        self.model.dof_frictionloss[6 + joint] = _JAM_TORQUE
 
     def _apply_pushes(self) -> None:
         """Write the sum of all pushes into MuJoCo's state."""
@@ -441,6 +470,7 @@ class Simulator:
         if self._is_derived_current:
             return
         self.data.ctrl[:] = self.actuator.peek(self._q, self._dq, *self._active_command)
+        self.data.ctrl[self._failed_joints] = 0.0
         mujoco.mj_forward(self.model, self.data)
         self._is_derived_current = True
 

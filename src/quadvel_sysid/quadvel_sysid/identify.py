@@ -29,15 +29,15 @@ from .logs.log import Log
 from .model.delays import longest_equivalent_delay, quantised_delays
 from .model.fit import fit
 from .model.torque_model import Model
-from .options import DEFAULTS, Devices, IdentifyOptions
+from .options import DEFAULTS, IdentifyOptions, SearchOptions
 from .report.identification import Identification
 from .report.outcome import Evidence, Outcome, Refit, SelectedEffect, build_identification
 from .report.sanity_checks import contradictions
 from .report.summary_text import motion_summary
 from .search.fitted_model import FittedModel, ModelEvaluator
-from .search.library import SignalTerm
 from .search.lost_commands import reassign_losses
-from .search.selection import Search
+from .search.regressors import RegressorCandidate
+from .search.selection import Search, SearchRecord
 from .statistics.baselines import baseline_errors
 from .statistics.confidence import intervals
 from .statistics.criterion import compare_residuals
@@ -103,32 +103,33 @@ def identify_dataset(
     base = options.base or ActuatorParameters.default()
     load = find_load(dataset, options.robot)
     progress(0.02, "gains and delays")
-    prepared, notes = _preprocess(dataset, load, options.devices)
+    prepared, notes = _preprocess(dataset, load, options.search)
     parts = prepared.parts
 
     # 2. Search for effects on a subset of the rows.
     evaluator, plain = _evaluator(prepared, options)
     search, before = Search(evaluator, _step_counter(progress)), evaluator.fit(plain)
-    best, best_laws = search.best(plain)
+    searched = search.best(plain)
+    best, best_effects = searched.best, searched.best_effects
 
     # 3. Refit to all rows, and choose between nested models by replays where there is a load.
     replay = None if load is None else Replay(load, prepared, base)
     progress(0.88, "replays" if replay else "intervals")
     models = [before, best]
     if replay:
-        laws = best_laws if best_laws is best else search.prune(best_laws)
-        models = [before, laws, best, *search.nested_models(laws)]
+        effects = best_effects if best_effects is best else search.prune(best_effects)
+        models = [before, effects, best, *search.nested_models(effects)]
     refitted = {one: _refit_all_rows(one, prepared) for one in dict.fromkeys(models)}
     chosen = replay.choose(refitted) if replay else best
 
     # 4. Intervals and report.
     progress(0.93, "intervals")
     final_rows = parts.fit_or_select if dataset.heldout else parts.all_rows
-    after = _refit_final_rows(refitted[chosen], final_rows, options.devices)
+    after = _refit_final_rows(refitted[chosen], final_rows, options.search)
     outcome = Outcome(
-        before=_refit_final_rows(refitted[before], final_rows, options.devices),
+        before=_refit_final_rows(refitted[before], final_rows, options.search),
         after=after,
-        evidence=_evidence(search, chosen, after.model, parts),
+        evidence=_evidence(search, searched.record, chosen, after.model, parts),
         half_widths=intervals(after.all_rows, attrs.evolve(parts, report=parts.report & final_rows)),
         noise=evaluator.noise,
         parts=parts,
@@ -144,14 +145,14 @@ def identify_dataset(
 
 
 def _preprocess(
-    dataset: Dataset, load: Load | None, devices: Devices
+    dataset: Dataset, load: Load | None, options: SearchOptions
 ) -> tuple[Preprocessed, list[tuple[str, Finding]]]:
     """Samples, data split and plain EAM, and notes on what was corrected."""
     windows = DRIVE_WINDOWS_S if dataset.body is None else (dataset.logs[0].period,)
     shortest = MIN_BLOCK_S
     if load is not None and not dataset.heldout:
         shortest = max(MIN_BLOCK_S, _BLOCK_STRETCHES * load.stretch_s)
-    return preprocess(dataset, windows, shortest, devices)
+    return preprocess(dataset, windows, shortest, options)
 
 
 def _evaluator(prepared: Preprocessed, options: IdentifyOptions) -> tuple[ModelEvaluator, Model]:
@@ -164,7 +165,7 @@ def _evaluator(prepared: Preprocessed, options: IdentifyOptions) -> tuple[ModelE
     samples = prepared.samples.drop_heldout(prepared.parts.fit_or_select)
     step = min(round(samples.tau.size / _SEARCH_VALUES), round(_MAX_SEARCH_STEP_S / samples.period))
     samples, rows = samples.thinned(max(step, 1))
-    evaluator = ModelEvaluator(prepared.parts.select_rows(rows), noise, options.cores, options.devices)
+    evaluator = ModelEvaluator(prepared.parts.select_rows(rows), noise, options.cores, options.search)
     return evaluator, attrs.evolve(plain, samples=samples)
 
 
@@ -181,30 +182,32 @@ def _refit_all_rows(fitted: FittedModel, prepared: Preprocessed) -> Model:
     if len(samples.t) > len(fitted.model.samples.t):
         model = reassign_losses(model, parts, evaluator.noise)
     model = fit(model, parts.fit_or_select)
-    return longest_equivalent_delay(model, parts.fit_or_select) if evaluator.devices.longest_delays else model
+    return longest_equivalent_delay(model, parts.fit_or_select) if evaluator.options.longest_delays else model
 
 
-def _refit_final_rows(model: Model, rows: Bools, devices: Devices) -> Refit:
+def _refit_final_rows(model: Model, rows: Bools, options: SearchOptions) -> Refit:
     """The model, and its refit to the rows that the reported values follow from."""
     final = fit(model, rows)
-    if devices.longest_delays:
+    if options.longest_delays:
         final = quantised_delays(longest_equivalent_delay(final, rows), rows)
     return Refit(model, final)
 
 
-def _evidence(search: Search, fitted: FittedModel, model: Model, parts: DataSplit) -> Evidence:
+def _evidence(
+    search: Search, record: SearchRecord, fitted: FittedModel, model: Model, parts: DataSplit
+) -> Evidence:
     """Evidence for and against effects; `model` is `fitted`, refitted to all rows."""
     effects = tuple(
-        SelectedEffect(*_heldout_gain(model, k, parts), search.indistinguishable_effects(fitted, k))
+        SelectedEffect(*_heldout_gain(model, k, parts), search.indistinguishable_effects(fitted, k, record))
         for k in range(len(model.effects))
     )
-    has_terms = any(isinstance(one.law, SignalTerm) for one in model.effects)
-    names = {one.law.name for one in model.effects}
+    has_regressors = any(isinstance(one.candidate, RegressorCandidate) for one in model.effects)
+    names = {one.candidate.name for one in model.effects}
     return Evidence(
         effects=effects,
-        rejected=tuple((name, *why) for name, why in search.rejected.items() if name not in names),
+        rejected=tuple((name, *why) for name, why in record.rejected.items() if name not in names),
         is_white=fitted.is_white,
-        correlates=() if fitted.is_white or has_terms else search.residual_correlates(fitted),
+        correlates=() if fitted.is_white or has_regressors else search.residual_correlates(fitted),
     )
 
 

@@ -1,4 +1,4 @@
-"""Options of an identification: what a user chooses, and the devices that an ablation switches off.
+"""Options of an identification: what a user chooses, and what the search tries.
 
 Each field states its description, unit and bounds in its metadata.
 """
@@ -22,47 +22,49 @@ def _option(default: Any, description: str, bounds: tuple[float, float] | None =
     return attrs.field(default=default, validator=validator, metadata=metadata)
 
 
-def _device(description: str) -> Any:
-    """A field for a device, which is on unless an ablation switches it off."""
+def _switch(description: str) -> Any:
+    """A field for what is on unless an ablation switches it off."""
     return _option(True, description, (False, True))
 
 
 @attrs.frozen
-class Devices:
-    """Devices of the identification; the ablation study measures the score without each of them.
+class SearchOptions:
+    """What the search tries, and how thoroughly; the ablation study measures the score without each.
 
-    The defaults are those of `quadvel identify`.
+    The data that the search works on are included. The defaults are those of `quadvel identify`.
     """
 
-    even_clocks: bool = _device("restore the even clock of jittering stamps")
-    averaged_encoders: bool = _device("average encoder noise that the drive did not act on")
-    sharp_accelerations: bool = _device("keep accelerations sharp where a command arrives")
+    even_clocks: bool = _switch("restore the even clock of jittering stamps")
+    averaged_encoders: bool = _switch("average encoder noise that the drive did not act on")
+    sharp_accelerations: bool = _switch("keep accelerations sharp where a command arrives")
     instants_per_row: int = _option(2, "instants of a row, for effects that act between rows", (1, 8))
     cluster_motion_rad: float = _option(0.02, "motion of some joint that ends a cluster", (0.0, 1.0), "rad")
-    kurtosis_test: bool = _device("test the residual for kurtosis as well as for autocorrelation")
+    kurtosis_test: bool = _switch("test the residual for kurtosis as well as for autocorrelation")
     delay_starts: int = _option(3, "points of the grid of delays from which fits start", (1, 100))
-    far_delays: bool = _device("try delays up to 8 ms from the present ones")
-    longest_delays: bool = _device("choose the longest equivalent delays, and whole drive steps")
-    screening_grid: bool = _device("screen candidates on a grid of delays")
+    far_delays: bool = _switch("try delays up to 8 ms from the present ones")
+    longest_delays: bool = _switch("choose the longest equivalent delays, and whole drive steps")
+    screening_grid: bool = _switch("screen candidates on a grid of delays")
     memory_cost: float = _option(
-        0.5, "further parameters of a law with memory or one like a delay", (0.0, 10.0)
+        0.5, "further parameters of an effect with memory or one like a delay", (0.0, 10.0)
     )
-    lost_commands_at_random: bool = _device("accept lost commands only if the command's age does not predict")
-    fitted_laws: int = _option(6, "laws that are fitted after a screening", (1, 100))
-    fitted_terms: int = _option(4, "terms that are fitted after a screening", (1, 100))
+    lost_commands_at_random: bool = _switch("accept lost commands only if they are lost at random")
+    fitted_effects: int = _option(6, "effects that are fitted after a screening", (1, 100))
+    fitted_regressors: int = _option(4, "regressors that are fitted after a screening", (1, 100))
     shared_trials: int = _option(3, "best candidates for which sharing across joints is tested", (0, 100))
-    second_starts: bool = _device("fit laws that shift the torque from two starts")
-    terms_at_nearby_delays: bool = _device("refit terms from nearby delays")
-    finer_terms: bool = _device("refine the shapes of terms after their screening")
-    laws_before_terms: bool = _device("prefer laws to terms that explain the log equally well")
-    special_cases: bool = _device("replace a law by its special case where the rows do not need it")
-    no_repeats: bool = _device("reject a law that is nested with one on the same joints")
-    elimination: bool = _device("remove effects that became unnecessary")
-    gains_of_each_joint: bool = _device("try gains and delays of each joint")
+    second_starts: bool = _switch("fit effects that shift the torque from two starts")
+    regressors_at_nearby_delays: bool = _switch("refit regressors from nearby delays")
+    finer_regressors: bool = _switch("refine the shapes of regressors after their screening")
+    effects_before_regressors: bool = _switch(
+        "prefer effects to regressors that explain the log equally well"
+    )
+    special_cases: bool = _switch("replace an effect by its special case where the rows do not need it")
+    no_repeats: bool = _switch("reject an effect that is nested with one on the same joints")
+    elimination: bool = _switch("remove effects that became unnecessary")
+    gains_of_each_joint: bool = _switch("try gains and delays of each joint")
 
 
-DEVICES = Devices()
-"""All devices."""
+SEARCH_DEFAULTS = SearchOptions()
+"""Everything on, as in `quadvel identify`."""
 
 
 @attrs.frozen
@@ -81,7 +83,7 @@ class IdentifyOptions:
     )
     robot: str | None = _option(None, "legs that replay the commands: aliengo, go2, an MJCF or URDF file")
     cores: int = _option(1, "worker processes; the report does not depend on them", (1, 1024))
-    devices: Devices = _option(DEVICES, "devices of the search; an ablation switches some off")
+    search: SearchOptions = _option(SEARCH_DEFAULTS, "what the search tries; an ablation switches some off")
 
 
 DEFAULTS = IdentifyOptions()

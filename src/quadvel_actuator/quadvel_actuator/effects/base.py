@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import enum
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Protocol
 
 import attrs
 import numpy as np
+from typing_extensions import override
 
-from quadvel_description.arrays import Array, Bools, Indices
+from quadvel_description.arrays import Array, Bools
 
 Params = Mapping[str, Array]
 Errors = tuple[Array, Array]
 """Errors that enter the PD law: q_des - q (rad) and dq_des - dq (rad/s)"""
+Memory = tuple[Array, ...]
 
 
 class Stage(enum.IntEnum):
@@ -46,8 +48,7 @@ DRIVE, JOINT = "drive", "joint"
 class View(Protocol):
     """Signals that an effect may use.
 
-    They come from rows of a log (`quadvel_sysid.data.signals.Signals`) or from one step of a running
-    model.
+    They come from the rows of a log, or from one step of a running model.
     """
 
     @property
@@ -81,18 +82,6 @@ class View(Protocol):
     @property
     def voltage(self) -> Any:
         """Supply voltage, V."""
-
-    @property
-    def sent(self) -> Any:
-        """Position targets of all commands in the order of sending, rad."""
-
-    @property
-    def packet(self) -> Any:
-        """Index into `sent` of the command in force."""
-
-    @property
-    def row(self) -> Any:
-        """Index of the row in the log."""
 
     @property
     def age(self) -> Any:
@@ -139,7 +128,7 @@ def stage_from_field(field: str, **stages: Stage) -> Any:
     Returns:
         A property for the class body.
     """
-    return property(lambda law: stages[getattr(law, field)])
+    return property(lambda effect: stages[getattr(effect, field)])
 
 
 def one_of(*words: str) -> Any:
@@ -167,29 +156,17 @@ _SETTING_TYPES: Mapping[str, tuple[type | tuple[type, ...], str]] = {
 """Annotations of settings that a parameter file may give: accepted types, and a description"""
 
 
-InitialGuess = Mapping[str, Any]
-"""Guess of every parameter that is not in `linear`: a number, or one per joint (J,)"""
-
-
 @attrs.frozen(eq=False)
-class EffectLaw(ABC):
+class EffectModel(ABC):
     """Actuator effect, an entry of the registry.
 
-    Subclass `ErrorLaw`, `TorqueLaw`, `AddedLaw` or `MemoryLaw` instead of this class.
+    Subclass `ErrorEffect`, `TorqueEffect`, `AddedEffect` or `MemoryEffect` instead of this class.
 
     Attributes:
         name: name in the registry, in parameter files and reports.
         stage: where in the drive it acts.
         parameters: its numbers, in order.
-        signal: signal over which the residual shows the shape of the effect.
-        shifts: whether it resembles a delay.
-        has_memory: whether it depends on other rows than the one it acts on.
-        acts_between_rows: whether it also depends on what happens between the rows of a log.
-        confounded_with_gain: whether the effect on all joints equals a deviation of a gain or of
-            delays. At least one joint has to be free of it.
-        all_joints_together: whether it happens to all joints of a robot at the same time.
-        shared_by_joints: whether it has one cause for all joints, so that they share its values.
-        motion: motion to record in order to distinguish it from other effects.
+        has_memory: whether it depends on the past, so that a row depends on the rows before.
         at: where an added torque acts: in the drive, so that it passes the output delay, or at the
             joint without delay.
     """
@@ -197,49 +174,11 @@ class EffectLaw(ABC):
     name: ClassVar[str]
     stage: ClassVar[Stage]
     parameters: ClassVar[tuple[Parameter, ...]]
-    signal: ClassVar[str] = "tau"
-    shifts: ClassVar[bool] = False
     has_memory: ClassVar[bool] = False
-    acts_between_rows: ClassVar[bool] = False
-    confounded_with_gain: ClassVar[bool] = False
-    all_joints_together: ClassVar[bool] = False
-    shared_by_joints: ClassVar[bool] = False
-    motion: ClassVar[str] = "richer motion"
     at: str = attrs.field(default=DRIVE, kw_only=True, validator=one_of(DRIVE, JOINT))
 
     @classmethod
-    def variants(cls, about: Any) -> Sequence[EffectLaw]:
-        """List the forms to try on a log.
-
-        Args:
-            about: data of the log, a `quadvel_sysid.search.library.Context`.
-
-        Returns:
-            Forms of the effect; empty where it cannot act.
-        """
-        return (cls(), cls(at=JOINT)) if cls.stage == Stage.ADDED else (cls(),)
-
-    @property
-    def indistinguishable_forms(self) -> tuple[EffectLaw, ...]:
-        """Forms that no log distinguishes from this one.
-
-        How far the parameters move between forms widens their intervals.
-        """
-        return ()
-
-    def special_case(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]] | None:
-        """Return the effect with fewer parameters that this one becomes in a limit.
-
-        Args:
-            p: parameters, (J,) each.
-
-        Returns:
-            The simpler effect and its parameters (J,), or None.
-        """
-        return None
-
-    @classmethod
-    def parse(cls, given: Mapping[str, Any], joints: Sequence[str]) -> tuple[EffectLaw, dict[str, Any]]:
+    def parse(cls, given: Mapping[str, Any], joints: Sequence[str]) -> tuple[EffectModel, dict[str, Any]]:
         """Read form and parameters from the mapping in a parameter file.
 
         Args:
@@ -281,7 +220,7 @@ class EffectLaw(ABC):
         return fields
 
     @classmethod
-    def from_settings(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectLaw:
+    def from_settings(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectModel:
         """Build the form with some settings.
 
         Args:
@@ -299,31 +238,6 @@ class EffectLaw(ABC):
         own = {field.name: (getattr(self, field.name), field.default) for field in attrs.fields(type(self))}
         return {name: value for name, (value, usual) in own.items() if value != usual}
 
-    @abstractmethod
-    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        """List starting points for a search of the parameters.
-
-        Args:
-            s: signals of the log, (N, J).
-            torque: N m, (N, J), prediction without the effect.
-            residual: N m, (N, J), measured torque minus `torque`; 0 in rows that are not to be
-                explained.
-
-        Returns:
-            Guesses; parameters in `linear` are left out.
-        """
-
-    def restricted_to(self, active: Bools) -> EffectLaw:
-        """Return the form that remains on some of the joints.
-
-        Args:
-            active: joints that keep the effect, (J,) bool.
-
-        Returns:
-            The form for these joints.
-        """
-        return self
-
     def canonical(self, p: dict[str, Array]) -> dict[str, Array]:
         """Map parameters to the unique representative with the same torque, within the bounds.
 
@@ -335,47 +249,7 @@ class EffectLaw(ABC):
         """
         return p
 
-    def excited_joints(self, p: Params, s: View) -> Bools:
-        """Find the joints whose motion shows the effect; on the others it passes for another one.
-
-        Args:
-            p: parameters, (J,) each.
-            s: signals of the log.
-
-        Returns:
-            (J,) bool.
-        """
-        return np.ones(s.q.shape[-1], dtype=bool)
-
-    def sampling_error(self, p: Params, s: View) -> dict[str, Array]:
-        """Return half widths of 95 % intervals of parameters that count random events.
-
-        Args:
-            p: parameters, (J,) each.
-            s: signals of the log.
-
-        Returns:
-            Half widths (J,) by parameter; empty for effects without such parameters.
-        """
-        return {}
-
-    def predictive(self) -> EffectLaw:
-        """Return the form without anything inferred from the measured torque, for prediction.
-
-        Returns:
-            The predictive form.
-        """
-        return self
-
-    def record_statistics(self) -> dict[str, float]:
-        """Return figures about this log that are no parameters.
-
-        Returns:
-            Figures by name.
-        """
-        return {}
-
-    def runtime_form(self, rng: np.random.Generator) -> EffectLaw:
+    def runtime_form(self, rng: np.random.Generator) -> EffectModel:
         """Return the form that a running model uses.
 
         Args:
@@ -391,8 +265,37 @@ class EffectLaw(ABC):
         """Names of the parameters, in order."""
         return tuple(parameter.name for parameter in self.parameters)
 
+    @abstractmethod
+    def series(self, x: Any, s: View, p: Params) -> Any:
+        """Apply the effect to all rows of a series.
 
-class ErrorLaw(EffectLaw):
+        Args:
+            x: values before the effect, (..., N, J): the errors, a pair of arrays, at stage ERRORS,
+                else the torque in N m.
+            s: signals of the rows.
+            p: parameters, (J,) or (B, 1, J).
+
+        Returns:
+            The values in place of `x`; at stage ADDED the torque to add, N m.
+        """
+
+    def step(self, x: Any, now: View, p: Params, memory: Memory, new: Bools | None) -> tuple[Any, Memory]:
+        """Advance a running model by one step.
+
+        Args:
+            x: values before the effect, (..., J); see `series`.
+            now: signals of this step.
+            p: parameters, (J,) or (..., J).
+            memory: memory after the step before.
+            new: environments that start from rest, (...,) bool, or None.
+
+        Returns:
+            The values in place of `x`, and the new memory.
+        """
+        return self.series(x, now, p), memory
+
+
+class ErrorEffect(EffectModel):
     """Effect on the errors that enter the PD law."""
 
     stage = Stage.ERRORS
@@ -410,8 +313,12 @@ class ErrorLaw(EffectLaw):
             The errors in place of `e`.
         """
 
+    @override
+    def series(self, x: Errors, s: View, p: Params) -> Errors:
+        return self.errors(x, s, p)
 
-class TorqueLaw(EffectLaw):
+
+class TorqueEffect(EffectModel):
     """Effect on the torque of the PD law."""
 
     @abstractmethod
@@ -427,20 +334,15 @@ class TorqueLaw(EffectLaw):
             N m, the torque in place of `x`.
         """
 
+    @override
+    def series(self, x: Array, s: View, p: Params) -> Array:
+        return self.torque(x, s, p)
 
-class AddedLaw(EffectLaw):
-    """Effect that adds a torque, linear in some of its parameters.
 
-    Attributes:
-        stage: always `Stage.ADDED`.
-        linear: names of the parameters that the torque is proportional to, term by term.
-        depends_on_drive_torque: whether it uses the torque of the drive. If not, it is fitted
-            faster.
-    """
+class AddedEffect(EffectModel):
+    """Effect that adds a torque."""
 
     stage = Stage.ADDED
-    linear: ClassVar[tuple[str, ...]]
-    depends_on_drive_torque: ClassVar[bool] = True
 
     @abstractmethod
     def torque(self, x: Array, s: View, p: Params) -> Array:
@@ -455,11 +357,12 @@ class AddedLaw(EffectLaw):
             N m, the torque to add.
         """
 
+    @override
+    def series(self, x: Array, s: View, p: Params) -> Array:
+        return self.torque(x, s, p)
 
-Memory = tuple[Array, ...]
 
-
-class MemoryLaw(EffectLaw):
+class MemoryEffect(EffectModel):
     """Effect with a memory: `advance` is one step, a series is one step after the other.
 
     At stage ERRORS `x` and the result are the pair of errors. At stage ADDED the result is the
@@ -501,12 +404,15 @@ class MemoryLaw(EffectLaw):
             The value in place of `x`, and the new memory.
         """
 
+    @override
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        """Apply the effect to all rows of a series; override it with a faster way.
+        """Apply the effect to all rows, one step after the other; override it with a faster way.
+
+        The memory is reset to rest where a stretch starts.
 
         Args:
             x: values before the effect, (..., N, J), or the pair of errors.
-            s: signals with `dt` and `start`; the memory is reset to rest where a stretch starts.
+            s: signals with `dt` and `start`.
             p: parameters, (J,) or (B, 1, J).
 
         Returns:
@@ -526,63 +432,25 @@ class MemoryLaw(EffectLaw):
         series = tuple(np.stack(np.broadcast_arrays(*one), axis=-2) for one in zip(*made, strict=True))
         return series if pair else series[0]
 
-
-def smooth_sign(v: Array, width: Array) -> Array:
-    """Smooth sign function tanh(v / width).
-
-    Args:
-        v: rad/s, velocity.
-        width: rad/s, velocity at which the result is 0.76.
-
-    Returns:
-        Values from -1 to 1, 0 at rest.
-    """
-    return evaluate_distinct(lambda each: np.tanh(v / each), width)
+    @override
+    def step(self, x: Any, now: View, p: Params, memory: Memory, new: Bools | None) -> tuple[Any, Memory]:
+        u = [getattr(now, name) for name in self.inputs]
+        if new is not None:
+            memory = reset_memory(memory, self.rest(x, u, p), new)
+        return self.advance(x, u, now.dt, p, memory)
 
 
-def evaluate_distinct(function: Callable[..., Array], *parameters: Array) -> Array:
-    """Evaluate a function once for each distinct parameter set of a batch.
-
-    Finite differences move one parameter at a time, so most sets of a batch are equal. Use it for
-    functions that take far longer than a copy of their result.
+def reset_memory(memory: Memory, rest: Memory, new: Bools) -> Memory:
+    """Reset the memory of some environments.
 
     Args:
-        function: function of the parameters.
-        *parameters: each (J,) or (B, 1, J).
+        memory: memory after the step before, or ().
+        rest: memory of joints at rest.
+        new: environments that start from rest, (...,) bool.
 
     Returns:
-        The value of `function`, as if it had been called with the whole batch.
+        The memory, at rest in these environments.
     """
-    moved = [one for one in parameters if np.ndim(one) == 3]
-    if not moved:
-        return function(*parameters)
-    first, which = distinct_indices(np.concatenate(moved, axis=-1))
-    return function(*(one[first] if np.ndim(one) == 3 else one for one in parameters))[which]
-
-
-def distinct_indices(batch: Array) -> tuple[Indices, Indices]:
-    """Find the distinct elements of a batch.
-
-    Args:
-        batch: (B, ...).
-
-    Returns:
-        Index of the first occurrence of each distinct element, and for each element (B,) which
-        distinct one it is.
-    """
-    met: dict[bytes, int] = {}
-    which = np.array([met.setdefault(one.tobytes(), len(met)) for one in batch])
-    return np.unique(which, return_index=True)[1], which
-
-
-def rms(x: Array) -> Array:
-    """Root mean square over the rows, plus 1e-9.
-
-    Args:
-        x: (N, J).
-
-    Returns:
-        (J,), above 0.
-    """
-    value: Array = np.sqrt(np.mean(x * x, axis=-2)) + 1e-9
-    return value
+    if not memory or new.all():
+        return rest
+    return tuple(np.where(new[..., None], fresh, old) for fresh, old in zip(rest, memory, strict=True))

@@ -13,14 +13,11 @@ from typing_extensions import override
 from quadvel_description.arrays import Array
 
 from .base import (
-    DRIVE,
-    JOINT,
-    AddedLaw,
-    ErrorLaw,
+    AddedEffect,
+    ErrorEffect,
     Errors,
-    InitialGuess,
     Memory,
-    MemoryLaw,
+    MemoryEffect,
     Parameter,
     Params,
     Stage,
@@ -28,7 +25,6 @@ from .base import (
     one_of,
 )
 
-_FAST_MOTION = "chirps up to 20 Hz and steps, small enough to stay below every bound"
 _TIME_CONSTANT = Parameter("T", "s", 0.0002, 0.1, 0.004)
 
 
@@ -84,19 +80,12 @@ def lag_series(x: Array, s: Any, time: Array) -> Array:
     return out.swapaxes(-1, -2)
 
 
-class FirstOrderLag(MemoryLaw):
+class FirstOrderLag(MemoryEffect):
     """First-order lag of the torque: T dtau/dt = tau* - tau."""
 
     name = "first_order_lag"
     stage = Stage.DYNAMICS
     parameters = (_TIME_CONSTANT,)
-    signal = "tau@history"
-    shifts = True
-    motion = _FAST_MOTION
-
-    @override
-    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        return [{"T": time} for time in (0.001, 0.002, 0.004, 0.007, 0.012, 0.025)]
 
     @override
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
@@ -119,20 +108,13 @@ class FirstOrderLag(MemoryLaw):
         return lag_series(before + late * (x - before), s, p["T"])
 
 
-class VelocityFilter(MemoryLaw):
+class VelocityFilter(MemoryEffect):
     """Low-pass filtered velocity in the damping term: T d(dq_f)/dt = dq - dq_f."""
 
     name = "velocity_filter"
     stage = Stage.ERRORS
     parameters = (_TIME_CONSTANT,)
     inputs = ("dq",)
-    signal = "dq@history"
-    shifts = True
-    motion = _FAST_MOTION
-
-    @override
-    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        return [{"T": time} for time in (0.001, 0.002, 0.004, 0.008, 0.015, 0.03)]
 
     @override
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
@@ -150,11 +132,11 @@ class VelocityFilter(MemoryLaw):
         return x[0], x[1] + s.dq - lag_series(even, s, p["T"])
 
 
-_ACCELERATION_SIGNALS = "ddq", "ddq_sharp", "ddq_smooth"
+ACCELERATION_SIGNALS = "ddq", "ddq_sharp", "ddq_smooth"
 
 
 @attrs.frozen(eq=False)
-class Armature(AddedLaw):
+class Armature(AddedEffect):
     """Rotor inertia: -J ddq.
 
     `of` selects the acceleration: `ddq`, a short difference quotient of dq; `ddq_sharp`, a shorter
@@ -163,27 +145,7 @@ class Armature(AddedLaw):
 
     name = "armature"
     parameters = (Parameter("J", "kg m^2", 0.0, 1.0, 0.005),)
-    linear = ("J",)
-    depends_on_drive_torque = False
-    signal = "ddq"
-    shifts = True
-    motion = _FAST_MOTION
-    of: str = attrs.field(default="ddq", validator=one_of(*_ACCELERATION_SIGNALS))
-
-    @classmethod
-    @override
-    def variants(cls, about: Any) -> Sequence[Armature]:
-        return tuple(cls(of=of, at=at) for of in _ACCELERATION_SIGNALS for at in (DRIVE, JOINT))
-
-    @property
-    @override
-    def indistinguishable_forms(self) -> tuple[Armature, ...]:
-        every = (attrs.evolve(self, of=of, at=at) for of in _ACCELERATION_SIGNALS for at in (DRIVE, JOINT))
-        return tuple(one for one in every if (one.of, one.at) != (self.of, self.at))
-
-    @override
-    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        return [{}]
+    of: str = attrs.field(default="ddq", validator=one_of(*ACCELERATION_SIGNALS))
 
     @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
@@ -191,7 +153,7 @@ class Armature(AddedLaw):
 
 
 @attrs.frozen(eq=False)
-class TimestampSkew(ErrorLaw):
+class TimestampSkew(ErrorEffect):
     """Time skew: `q` or `dq` reaches the drive `late` s later than its rows say.
 
     It is earlier if `late` is negative. The command keeps its time, so a position that is early on
@@ -204,32 +166,7 @@ class TimestampSkew(ErrorLaw):
 
     name = "timestamp_skew"
     parameters = (Parameter("late", "s", -0.03, 0.03, 0.002),)
-    shifts = True
-    motion = _FAST_MOTION
     channel: str = attrs.field(default="dq", validator=one_of("dq", "q"))
-
-    @property
-    @override
-    def signal(self) -> str:  # type: ignore[override]
-        return f"{self.channel}@history"
-
-    @property
-    @override
-    def confounded_with_gain(self) -> bool:  # type: ignore[override]
-        """Whether skew on all joints equals two other delays, which holds for positions."""
-        return self.channel == "q"
-
-    @classmethod
-    @override
-    def variants(cls, about: Any) -> Sequence[TimestampSkew]:
-        return cls("dq"), cls("q")
-
-    @override
-    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        return [
-            {"late": late}
-            for late in (-0.012, -0.008, -0.005, -0.003, -0.0015, 0.0015, 0.003, 0.005, 0.008, 0.012)
-        ]
 
     @override
     def errors(self, e: Errors, s: View, p: Params) -> Errors:
@@ -237,4 +174,4 @@ class TimestampSkew(ErrorLaw):
         return (e[0] + s.q - shifted, e[1]) if self.channel == "q" else (e[0], e[1] + s.dq - shifted)
 
 
-LAWS = (FirstOrderLag, VelocityFilter, Armature, TimestampSkew)
+EFFECTS = (FirstOrderLag, VelocityFilter, Armature, TimestampSkew)

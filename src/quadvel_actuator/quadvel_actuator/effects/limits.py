@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,32 +11,22 @@ from typing_extensions import override
 from quadvel_description.arrays import Array
 
 from . import recurrence
-from .base import EffectLaw, InitialGuess, Memory, MemoryLaw, Parameter, Params, Stage, TorqueLaw, View
-
-_SATURATING_MOTION = "fast and large steps that ask for more torque than the drive gives"
+from .base import Memory, MemoryEffect, Parameter, Params, Stage, TorqueEffect, View
 
 
-class TorqueSaturation(TorqueLaw):
+class TorqueSaturation(TorqueEffect):
     """Constant torque limit: tau = clip(tau*, -limit, limit)."""
 
     name = "torque_saturation"
     stage = Stage.LIMIT
     parameters = (Parameter("limit", "N m", 0.1, 500.0, 10.0),)
-    signal = "tau"
-    motion = _SATURATING_MOTION
-
-    @override
-    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        shares = (0.75, 0.9, 0.96, 0.99, 0.997)
-        seldom = [{"limit": share * np.abs(torque).max(axis=0)} for share in (0.8, 0.9, 0.97)]
-        return [*({"limit": np.quantile(np.abs(torque), share, axis=0)} for share in shares), *seldom]
 
     @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return np.clip(x, -p["limit"], p["limit"])
 
 
-class TorqueSpeedLimit(TorqueLaw):
+class TorqueSpeedLimit(TorqueEffect):
     """Speed-torque curve of a DC motor: the limit falls linearly with speed.
 
     |tau| <= stall (1 - v / no_load), within 0 and stall, v the speed along the torque
@@ -48,21 +38,6 @@ class TorqueSpeedLimit(TorqueLaw):
         Parameter("stall", "N m", 0.1, 500.0, 10.0),
         Parameter("no_load", "rad/s", 0.2, 300.0, 10.0),
     )
-    signal = "dq"
-    motion = _SATURATING_MOTION
-
-    @override
-    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        top = np.quantile(np.abs(s.dq), 0.98, axis=0)
-        return [
-            {"stall": np.quantile(np.abs(torque), share, axis=0) * over, "no_load": fast * top}
-            for share, over in ((0.85, 1.0), (0.97, 1.0), (1.0, 1.0), (1.0, 1.4))
-            for fast in (0.6, 0.9, 1.3, 2.0, 4.0)
-        ]
-
-    @override
-    def special_case(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]]:
-        return TorqueSaturation(), {"limit": p["stall"]}
 
     @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
@@ -72,7 +47,7 @@ class TorqueSpeedLimit(TorqueLaw):
         return np.clip(x, -bound(-s.dq), bound(s.dq))
 
 
-class SlewLimit(MemoryLaw):
+class SlewLimit(MemoryEffect):
     """Rate limit: |dtau/dt| <= rate.
 
     If a new command arrives within a step, the torque keeps its earlier slope until then.
@@ -80,19 +55,8 @@ class SlewLimit(MemoryLaw):
 
     name = "slew_limit"
     stage = Stage.DYNAMICS
-    acts_between_rows = True
     inputs = ("age",)
     parameters = (Parameter("rate", "N m/s", 5.0, 50000.0, 300.0),)
-    signal = "tau@history"
-    shifts = True
-    motion = _SATURATING_MOTION
-
-    @override
-    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        slope = np.abs(np.diff(torque, axis=0)) / s.dt[1:]
-        # The last guess limits nothing, for joints without the effect.
-        shares = (0.5, 0.7, 0.85, 0.94, 0.98, 0.992, 0.998, 1.0)
-        return [{"rate": np.quantile(slope, share, axis=0) + 5.0} for share in shares]
 
     @override
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
@@ -109,4 +73,4 @@ class SlewLimit(MemoryLaw):
         return recurrence.rate_limit_series(x, s.age, s.dt, s.start, p["rate"])
 
 
-LAWS = (TorqueSaturation, TorqueSpeedLimit, SlewLimit)
+EFFECTS = (TorqueSaturation, TorqueSpeedLimit, SlewLimit)

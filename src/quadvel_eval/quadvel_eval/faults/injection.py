@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import attrs
-import mujoco
 import numpy as np
 
 from quadvel_description.arrays import Array, Bools
@@ -233,26 +232,13 @@ def _wrong(field: str, true: Array) -> Array:
 
 
 def _dead_drive(stack: Stack, rng: Rng) -> None:
-    """Set the torque of one random drive to zero, also in its feedback."""
-    joint = int(rng.integers(12))
-    step = stack.simulator.actuator.step
-
-    def without(*law: Any) -> Any:
-        torque = np.array(step(*law))
-        torque[joint] = 0.0
-        return torque
-
-    stack.simulator.actuator.step = without  # type: ignore[method-assign, assignment]
+    """Switch off one random drive."""
+    stack.simulator.fail_joint(JOINT_NAMES[int(rng.integers(12))])
 
 
 def _jammed(stack: Stack, rng: Rng) -> None:
     """Block one random thigh or calf joint by friction."""
-    joint = mujoco.mj_name2id(
-        stack.simulator.model,
-        mujoco.mjtObj.mjOBJ_JOINT,
-        JOINT_NAMES[int(rng.choice((1, 2, 4, 5, 7, 8, 10, 11)))],
-    )
-    stack.simulator.model.dof_frictionloss[stack.simulator.model.jnt_dofadr[joint]] = 500.0
+    stack.simulator.jam_joint(JOINT_NAMES[int(rng.choice((1, 2, 4, 5, 7, 8, 10, 11)))])
 
 
 def _killed(name: str) -> Callable[[Stack, Rng], None]:

@@ -153,7 +153,7 @@ class Stack:
         self.sensor_fault: Callable[[int, RobotState], RobotState] | None = None
         self.processes = {name: Process() for name in ("controller", "estimator", "mux", "planner")}
         config = ControlConfig()
-        self.supervisor = Supervisor(policy, config, KalmanEstimator(), guards)
+        self.supervisor = Supervisor(policy, config.supervisor, KalmanEstimator(), guards)
         self._loop = ControlLoop(self.supervisor, config, self._answer, self._clock, steady=self._steady)
         self._tracker = VelocityTracker(estimator)
         self._mux = CommandMux([PLANNER])

@@ -35,6 +35,8 @@ from .stage import DISTANCE_BAND_M, SETTLING_TIME_S
 
 AVERAGING_TIME_S = 0.35  # of compared velocities, to remove the sway of a stride
 ODOMETRY_INTERVAL_TICKS = 4  # between odometry messages
+STUCK_TIME_S = 180.0  # a robot that stays within STUCK_RADIUS_M for so long ends the tour
+STUCK_RADIUS_M = 1.0
 
 
 @attrs.frozen(kw_only=True)
@@ -101,6 +103,7 @@ class Tour:
         simulator: The robot.
         walked: Path length of the trunk so far, m.
         fell: Whether the robot fell.
+        stuck: Whether the robot stayed within `STUCK_RADIUS_M` for `STUCK_TIME_S`.
         planning: CPU time of each planner step, s.
     """
 
@@ -117,7 +120,7 @@ class Tour:
         self._follower = Follower(self._config)
         self._poses = PoseHistory([self._config.laser_x, self._config.laser_y, self._config.laser_yaw])
         self._clearances = Clearances(self.world, self._config)
-        self.walked, self.fell = 0.0, False
+        self.walked, self.fell, self.stuck = 0.0, False, False
         self.planning: list[float] = []
 
     @property
@@ -129,12 +132,13 @@ class Tour:
             distance=self.setup.distance,
             walked=self.walked,
             fell=self.fell,
+            stuck=self.stuck,
             touched=self.simulator.touch_counts,
             planning=self.planning,
         )
 
     def samples(self) -> Iterator[TourSample]:
-        """Simulate until the path length is reached or the robot falls.
+        """Simulate until the path length is reached, or the robot falls or is stuck.
 
         Yields:
             Samples, one per planner period.
@@ -144,6 +148,7 @@ class Tour:
         commanded, velocity, command = np.zeros(3), np.zeros(3), np.zeros(3)
         share, often, tick = TICK / AVERAGING_TIME_S, round(PERIOD_S / TICK), 0
         last = self.simulator.truth().position[:2].copy()
+        left, left_at = last, self.simulator.truth().time  # where and when the robot last moved on
         plan: Plan | None = None
         while self.walked < self.setup.path_length:
             try:
@@ -181,6 +186,11 @@ class Tour:
                 self.walked += float(np.hypot(*(here - last)))
                 last = here.copy()
                 yield self._sample(sample, commanded, velocity, plan)
+                if np.hypot(*(here - left)) > STUCK_RADIUS_M:
+                    left, left_at = last, now
+                elif now - left_at > STUCK_TIME_S:
+                    self.stuck = True
+                    return
             tick += 1
 
     def _sample(self, sample: Sample, commanded: Array, velocity: Array, plan: Plan) -> TourSample:
@@ -211,6 +221,7 @@ class Outcome:
         distance: Set distance to the person, m.
         walked: Path length of the trunk, m.
         fell: Whether the robot fell.
+        stuck: Whether the robot no longer moved on.
         touched: Number of contacts with each obstacle.
         planning: CPU time of each planner step, s; empty if unknown.
     """
@@ -220,6 +231,7 @@ class Outcome:
     distance: float
     walked: float
     fell: bool
+    stuck: bool = False
     touched: Mapping[str, int]
     planning: Sequence[float] = ()
 

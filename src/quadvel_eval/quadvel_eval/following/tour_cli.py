@@ -25,7 +25,7 @@ def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
         console: Console of bar and table.
 
     Returns:
-        Whether the robot neither fell nor touched anything.
+        Whether the robot neither fell nor touched anything, and was not stuck.
 
     Raises:
         KeyboardInterrupt: Ctrl-C ended the walk.
@@ -56,4 +56,4 @@ def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
         console.print(f"written to {out}: tour.json, tour.png; a tour has no video")
     if is_stopped:
         raise KeyboardInterrupt
-    return bool(samples) and not (tour.fell or tour.simulator.touch_counts)
+    return bool(samples) and not (tour.fell or tour.stuck or tour.simulator.touch_counts)

@@ -101,6 +101,7 @@ def tour_table(figures: Mapping[str, Any]) -> Table:
             "3100 m in 37 min",
         ),
         ("fell", "yes" if figures["fell"] else "no", "no"),
+        ("stuck", "yes: it no longer moved on, and the tour ended" if figures["stuck"] else "no", "no"),
         ("touched", touched, ""),
         ("error of the velocity, mean", f"{n(figures['error_xy'], '.3f')} m/s", f"{PAPER_XY} m/s"),
         ("error of the yaw rate, mean", f"{n(figures['error_wz'], '.3f')} rad/s", f"{PAPER_WZ} rad/s"),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from quadvel_policy.observation import CommandLimits
+from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
 
 from ..grid import Cell, CellResult, run_cell
@@ -118,7 +118,7 @@ def largest_turn_error(records: Sequence[Record]) -> float:
     return largest(records, "error_wz")
 
 
-def command_limits(study: Study, policy: str) -> CommandLimits:
+def command_limits(study: Study, policy: str) -> VelocityCommandLimits:
     """Read the command limits of a policy from its file.
 
     Args:
@@ -131,7 +131,7 @@ def command_limits(study: Study, policy: str) -> CommandLimits:
     return PolicyFile(study.policies[policy]).metadata.limits
 
 
-def is_within_limits(command: Command, bounds: CommandLimits) -> bool:
+def is_within_limits(command: Command, bounds: VelocityCommandLimits) -> bool:
     """Return whether command limits leave a command unchanged.
 
     Args:
@@ -144,7 +144,7 @@ def is_within_limits(command: Command, bounds: CommandLimits) -> bool:
     return bool(np.allclose(bounds.clamp(command), command, rtol=0.0, atol=1e-9))
 
 
-def max_command_along(direction: Command, bounds: CommandLimits) -> float:
+def max_command_along(direction: Command, bounds: VelocityCommandLimits) -> float:
     """Return the largest command along one axis.
 
     Args:

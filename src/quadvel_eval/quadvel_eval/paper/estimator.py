@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from quadvel_policy.observation import CommandLimits
+from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_sim.terrain import Terrain
 
 from ..walk import Setup, Walk, make_loop, record_until_fall
@@ -24,7 +24,7 @@ ESTIMATORS = ("learned", "kalman")
 GROUNDS = ("flat", "rough")
 
 
-def random_walk(setup: Setup, seed: int, bounds: CommandLimits, seconds: float) -> Walk | None:
+def random_walk(setup: Setup, seed: int, bounds: VelocityCommandLimits, seconds: float) -> Walk | None:
     """Walk random commands, uniform in the ellipsoid spanned by the limits.
 
     Args:

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from quadvel_description import robot
 from quadvel_description.state import JointCommand, RobotState
-from quadvel_policy.observation import CommandLimits
+from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
@@ -112,7 +112,7 @@ def record_foot_lifting(seed: int, seconds: float) -> Log:
     return simulator.log(f"Eq. 9, seed {seed}", TRANSITION_TIME_S)
 
 
-def record_mixed_walk(setup: Setup, seed: int, bounds: CommandLimits) -> Log:
+def record_mixed_walk(setup: Setup, seed: int, bounds: VelocityCommandLimits) -> Log:
     """Record a walk with standing, running, turns, sideways steps and stops, up to a fall.
 
     Args:
@@ -138,7 +138,9 @@ def record_mixed_walk(setup: Setup, seed: int, bounds: CommandLimits) -> Log:
     return simulator.log("mixed motion", start, start + (walk.time[-1] if walk else 0.0))
 
 
-def identify_and_evaluate(setup: Setup, data: str, bounds: CommandLimits, seconds: float) -> list[Record]:
+def identify_and_evaluate(
+    setup: Setup, data: str, bounds: VelocityCommandLimits, seconds: float
+) -> list[Record]:
     """Fit the actuator model to the motion of Eq. 9 and evaluate it on held-out data.
 
     Args:

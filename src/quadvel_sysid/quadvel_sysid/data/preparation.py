@@ -15,7 +15,7 @@ import numpy as np
 from ..logs.excerpts import has_jitter, restore_even_clock
 from ..logs.findings import Finding
 from ..logs.log import Log, LogError
-from ..options import DEVICES, Devices
+from ..options import SEARCH_DEFAULTS, SearchOptions
 from .dataset import Dataset
 from .noise import encoder_variance, noise_variance
 from .plain_model import Eam, fit_eam
@@ -63,7 +63,7 @@ def preprocess(
     dataset: Dataset,
     windows: Sequence[float],
     shortest: float = MIN_BLOCK_S,
-    devices: Devices = DEVICES,
+    options: SearchOptions = SEARCH_DEFAULTS,
 ) -> tuple[Preprocessed, list[tuple[str, Finding]]]:
     """Choose the time stamps and the averaging that explain the torque best.
 
@@ -71,20 +71,20 @@ def preprocess(
         dataset: The logs.
         windows: Steps (s) of the drive that the plain model tries.
         shortest: Shortest block, s.
-        devices: Devices of the identification.
+        options: Options of the search.
 
     Returns:
         The preprocessed logs, and a note for each choice other than the logs as they are.
     """
 
     def fit_logs(logs: Sequence[Log], steady: float = 0.0) -> Preprocessed:
-        samples = Samples.of(logs, steady, devices)
-        parts = split_rows(samples, dataset, shortest, devices.cluster_motion_rad)
+        samples = Samples.of(logs, steady, options)
+        parts = split_rows(samples, dataset, shortest, options.cluster_motion_rad)
         return Preprocessed(samples, parts, fit_eam(samples, parts.fit, windows=windows))
 
     logs: Sequence[Log] = dataset.logs
     prepared, notes = fit_logs(logs), []
-    if devices.even_clocks and any(has_jitter(log) for log in logs):
+    if options.even_clocks and any(has_jitter(log) for log in logs):
         even = [restore_even_clock(log) for log in logs]
         other = fit_logs(even)
         if other.eam.mse <= _EVEN_CLOCK_ERROR_RATIO * prepared.eam.mse:
@@ -92,7 +92,7 @@ def preprocess(
             text = "the even clock of the sender explains the torque better and was restored"
             notes.append(("t", f"t: the stamps jitter as those of received messages do; {text}"))
     steady = 0.0
-    if devices.averaged_encoders:
+    if options.averaged_encoders:
         prepared, steady = _choose_averaging(prepared, lambda steady: fit_logs(logs, steady))
     if steady:
         text = f"is averaged out over {1e3 * steady:.3g} ms to either side"
@@ -101,7 +101,7 @@ def preprocess(
 
 
 def split_rows(
-    samples: Samples, dataset: Dataset, shortest: float, motion: float = DEVICES.cluster_motion_rad
+    samples: Samples, dataset: Dataset, shortest: float, motion: float = SEARCH_DEFAULTS.cluster_motion_rad
 ) -> DataSplit:
     """Divide the rows into blocks that are fitted, used for selection, or held out.
 

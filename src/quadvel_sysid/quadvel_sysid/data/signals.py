@@ -19,7 +19,7 @@ import numpy as np
 from quadvel_description.arrays import Array, Bools, Indices
 
 from ..logs.log import Log
-from ..options import DEVICES, Devices
+from ..options import SEARCH_DEFAULTS, SearchOptions
 from .log_signals import ALL_JOINTS, Joints, LogSignals, as_double
 
 Made = TypeVar("Made")
@@ -264,13 +264,15 @@ class Samples:
     _selections: dict[bytes, Samples] = attrs.field(factory=dict, init=False, repr=False)
 
     @classmethod
-    def of(cls, logs: Sequence[Log], steady: float = 0.0, devices: Devices = DEVICES) -> Samples:
+    def of(
+        cls, logs: Sequence[Log], steady: float = 0.0, options: SearchOptions = SEARCH_DEFAULTS
+    ) -> Samples:
         """Concatenate the rows of logs.
 
         Args:
             logs: Logs with the same joints.
             steady: Half width of the lines that smooth q and dq, s; 0 for none.
-            devices: Devices of the identification.
+            options: Options of the search.
 
         Returns:
             The samples of all rows.
@@ -279,14 +281,14 @@ class Samples:
         known = {name for name in ("kp", "kd") if all(getattr(log, name) is not None for log in logs)}
         commanded = "kp" in known
         known -= {"kd"} if undamped else set()
-        series = [LogSignals(log, steady, known, devices.sharp_accelerations) for log in logs]
+        series = [LogSignals(log, steady, known, options.sharp_accelerations) for log in logs]
         starts, steps, settled = zip(*map(_stretches, logs), strict=True)
         t = np.concatenate([one.t for one in series])
         return cls(
             sources=Sources.of(series),
             commanded=commanded,
             undamped=undamped,
-            instants_per_row=devices.instants_per_row,
+            instants_per_row=options.instants_per_row,
             period=float(np.median(np.concatenate([np.diff(log.t) for log in logs]))),
             log_of_row=np.repeat(np.arange(len(logs)), [len(log.t) for log in logs]),
             t=t,

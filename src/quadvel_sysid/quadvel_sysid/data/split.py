@@ -11,7 +11,7 @@ import numpy as np
 
 from quadvel_description.arrays import Array, Bools, Indices
 
-from ..options import DEVICES
+from ..options import SEARCH_DEFAULTS
 from .signals import Samples
 
 CLUSTER_DURATION_S = 0.1
@@ -73,7 +73,7 @@ class DataSplit:
         return total
 
 
-def cluster_starts(samples: Samples, motion: float = DEVICES.cluster_motion_rad) -> Indices:
+def cluster_starts(samples: Samples, motion: float = SEARCH_DEFAULTS.cluster_motion_rad) -> Indices:
     """Divide the rows into clusters for the tests.
 
     A cluster begins where a log begins, or when at least `CLUSTER_DURATION_S` has passed and some

@@ -8,15 +8,16 @@ from typing import Any
 import attrs
 import numpy as np
 
-from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
+from quadvel_actuator.effects.basis_regressors import LEARNED_RESIDUAL
 from quadvel_actuator.parameters import ActuatorParameters, DelayPair, Effect
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.robot import JOINT_NAMES
 
 from ..data.split import DataSplit
+from ..model.applied_effect import AppliedEffect
 from ..model.delays import running_delays
-from ..model.torque_model import AppliedEffect, Model, linear_columns
-from ..search.library import SignalTerm
+from ..model.torque_model import Model
+from ..search.regressors import RegressorCandidate
 
 
 def actuator_parameters(
@@ -45,7 +46,7 @@ def actuator_parameters(
         torque_limit=torque_limits(base, joints),
         pairs=(pair,),
         torque_noise=error,
-        effects=(*_law_effects(model, widths), *_term_effect(model, parts.fit), *own),
+        effects=(*_named_effects(model, widths), *_regressor_effect(model, parts.fit), *own),
         **deltas,
     )
 
@@ -64,11 +65,11 @@ def mean_square(error: Array, rows: Bools) -> float:
     return float(np.sum(np.where(rows, error, 0.0) ** 2) / count) if count else 0.0
 
 
-def _law_effects(model: Model, widths: Sequence[Array]) -> list[Effect]:
-    """The laws of the registry as effects of a parameter file."""
+def _named_effects(model: Model, widths: Sequence[Array]) -> list[Effect]:
+    """The effects of the registry as those of a parameter file."""
     found = []
     for k, effect in enumerate(model.effects):
-        if isinstance(effect.law, SignalTerm):
+        if isinstance(effect.candidate, RegressorCandidate):
             continue
         params = parameter_entries(effect, widths[k] if widths else np.zeros_like(effect.values))
         values, units, ranges = (
@@ -76,29 +77,33 @@ def _law_effects(model: Model, widths: Sequence[Array]) -> list[Effect]:
         )
         acts = tuple(acting_joints(effect.active, model.samples.joints))
         found.append(
-            Effect(effect.law.name, acts, values | law_settings(effect), units, ranges if widths else {})
+            Effect(
+                effect.candidate.name, acts, values | effect_settings(effect), units, ranges if widths else {}
+            )
         )
     return found
 
 
-def _term_effect(model: Model, rows: Bools) -> list[Effect]:
+def _regressor_effect(model: Model, rows: Bools) -> list[Effect]:
     """All regressors of named signals as one effect; `rows` (N, J) give their torque bounds."""
     joints = model.samples.joints
     saved = [
-        effect.law.running_term(effect, _peak_torque(model, effect, rows)).to_entry(joints)
+        effect.candidate.basis_regressor(
+            effect.active, effect.values, _peak_torque(model, effect, rows)
+        ).to_entry(joints)
         for effect in model.effects
-        if isinstance(effect.law, SignalTerm)
+        if isinstance(effect.candidate, RegressorCandidate)
     ]
     if not saved:
         return []
-    active = [effect.active for effect in model.effects if isinstance(effect.law, SignalTerm)]
+    active = [effect.active for effect in model.effects if isinstance(effect.candidate, RegressorCandidate)]
     acts = acting_joints(np.any(active, axis=0), joints)
-    return [Effect(TERMS, tuple(acts), {"terms": saved})]
+    return [Effect(LEARNED_RESIDUAL, tuple(acts), {"terms": saved})]
 
 
 def _peak_torque(model: Model, effect: AppliedEffect, rows: Bools) -> Array:
     """Largest absolute torque (J,) of a regressor on `rows`, the bound in a running model."""
-    torque = np.einsum("kj,knj->nj", effect.values, linear_columns(model, effect))
+    torque = np.einsum("kj,knj->nj", effect.values, model.linear_columns(effect))
     return np.max(np.abs(torque) * rows, axis=0)
 
 
@@ -159,7 +164,7 @@ def parameter_entries(effect: AppliedEffect, half: Array) -> dict[str, dict[str,
         For each parameter name a dict with `value`, `ci95` and `unit`.
     """
     params = {}
-    for parameter, values, width in zip(effect.law.parameters, effect.values, half, strict=True):
+    for parameter, values, width in zip(effect.candidate.parameters, effect.values, half, strict=True):
         value, ci = value_and_interval(
             values[effect.active], width[effect.active], parameter.low, parameter.high
         )
@@ -200,8 +205,8 @@ def acting_joints(active: Bools, joints: Sequence[str]) -> list[str]:
     return [name for name, acts in zip(joints, active, strict=True) if acts]
 
 
-def law_settings(effect: AppliedEffect) -> dict[str, Any]:
-    """Return the settings of an effect's law.
+def effect_settings(effect: AppliedEffect) -> dict[str, Any]:
+    """Return the settings of an effect.
 
     Args:
         effect: The fitted effect.
@@ -213,5 +218,5 @@ def law_settings(effect: AppliedEffect) -> dict[str, Any]:
         name: [v for v, acts in zip(value, effect.active, strict=True) if acts]
         if isinstance(value, list)
         else value
-        for name, value in effect.law.settings.items()
+        for name, value in effect.candidate.settings.items()
     }

@@ -69,9 +69,9 @@ class Replay:
     def choose(self, models: Mapping[Key, Model]) -> Key:
         """Choose the model that replays the motion best.
 
-        A later model has to reduce the error of the speed clearly: laws against the plain model,
-        regressors against laws, and fewer laws against all. Regressors may fit encoder errors, or
-        predict torque only along the recorded motion. A law may describe how the log was written.
+        A later model has to reduce the error of the speed clearly: effects against the plain model,
+        regressors against effects, and fewer effects against all. Regressors may fit encoder errors, or
+        predict torque only along the recorded motion. An effect may describe how the log was written.
         None of these improves the replayed motion.
 
         Args:

@@ -17,9 +17,10 @@ from scipy.sparse.linalg import splu
 
 from quadvel_description.arrays import Array, Bools
 
-from ..options import DEVICES, Devices
+from ..options import SEARCH_DEFAULTS, SearchOptions
 from ..parallel import parallel_map
-from .torque_model import MAX_DELAYS_S, Model, Unknowns, jacobian, pack, with_slots
+from .jacobian import Unknowns, jacobian, pack, with_slots
+from .torque_model import MAX_DELAYS_S, Model
 
 _CONVERGED = 2e-5
 """Relative reduction of the error below which a fit has converged."""
@@ -46,7 +47,7 @@ def fit(model: Model, rows: Bools, iterations: int = 12, delays: bool = True) ->
     Returns:
         The fitted model in canonical form, on the samples of `model`.
     """
-    # The error falls with every step. Laws with memory need all rows, others the fitted rows alone.
+    # The error falls with every step. Effects with memory need all rows, others the fitted rows alone.
     samples, (model, rows) = model.samples, _fitted_rows_only(model, rows)
     unknowns = Unknowns.of(model, delays)
     error = squared_error(model, rows)
@@ -61,9 +62,9 @@ def fit(model: Model, rows: Bools, iterations: int = 12, delays: bool = True) ->
 
 
 def _fitted_rows_only(model: Model, rows: Bools) -> tuple[Model, Bools]:
-    """The model on the fitted rows and their mask; on all rows if a law has memory."""
+    """The model on the fitted rows and their mask; on all rows if an effect has memory."""
     used: Bools = np.asarray(rows.any(axis=1))
-    if used.all() or any(effect.law.has_memory for effect in model.effects):
+    if used.all() or any(effect.candidate.has_memory for effect in model.effects):
         return model, rows
     return attrs.evolve(model, samples=model.samples.select_rows(used)), rows[used]
 
@@ -77,14 +78,16 @@ _NEAR_DELAY_CHANGES_S = (-0.002, -0.001, 0.001, 0.002)
 """Coarse grid of changes of the sum of delays, s."""
 
 
-def fit_delay_profile(model: Model, rows: Bools, cores: int = 1, devices: Devices = DEVICES) -> Model:
+def fit_delay_profile(
+    model: Model, rows: Bools, cores: int = 1, options: SearchOptions = SEARCH_DEFAULTS
+) -> Model:
     """Fit a model from the best points of a grid of delays (profile likelihood).
 
     Args:
         model: A fitted model.
         rows: Samples to fit, (N, J) bool.
         cores: Worker processes.
-        devices: Devices of the search.
+        options: Options of the search.
 
     Returns:
         The model with the least squared error, among `model` and the fits.
@@ -95,9 +98,9 @@ def fit_delay_profile(model: Model, rows: Bools, cores: int = 1, devices: Device
     samples, (model, rows) = model.samples, _fitted_rows_only(model, rows)
     shifts = (
         *product(_TOTAL_DELAY_CHANGES_S, _OUTPUT_DELAY_CHANGES_S),
-        *product(_FAR_DELAY_CHANGES_S if devices.far_delays else (), (0.0,)),
+        *product(_FAR_DELAY_CHANGES_S if options.far_delays else (), (0.0,)),
     )
-    starts = [model, *_one_step_at_each_delay(model, rows, shifts, cores)[: devices.delay_starts]]
+    starts = [model, *_one_step_at_each_delay(model, rows, shifts, cores)[: options.delay_starts]]
     fits = parallel_map(lambda k: fit(starts[k], rows), len(starts), cores, model.samples)
     return attrs.evolve(min([model, *fits], key=lambda one: squared_error(one, rows)), samples=samples)
 
@@ -216,13 +219,13 @@ def _weight_penalty(model: Model, unknowns: Unknowns, hessian: Array) -> Array:
     first = 2
     for effect in model.effects:
         count = len(effect.values)
-        shape = getattr(effect.law, "penalty", None)
-        if shape is not None:
+        penalty = effect.candidate.penalty
+        if penalty is not None:
             joints = np.flatnonzero(effect.active)
             _, first_of_group = np.unique(effect.groups[joints], return_index=True)
             for j in joints[first_of_group]:
                 at = unknowns.index[first : first + count, j]
-                total[np.ix_(at, at)] += shape * float(np.mean(hessian[at, at])) * RIDGE
+                total[np.ix_(at, at)] += penalty * float(np.mean(hessian[at, at])) * RIDGE
         first += count
     return total
 

@@ -9,7 +9,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
+from quadvel_actuator.effects.basis_regressors import LEARNED_RESIDUAL
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description.arrays import Array
 
@@ -19,16 +19,17 @@ from ..data.split import DataSplit
 from ..export.export_parameters import (
     acting_joints,
     actuator_parameters,
+    effect_settings,
     gain_deviations,
-    law_settings,
     mean_square,
     parameter_entries,
     torque_limits,
     value_and_interval,
 )
 from ..logs.findings import Finding as LogFinding
-from ..model.torque_model import AppliedEffect, Model
-from ..search.library import SignalTerm
+from ..model.applied_effect import AppliedEffect
+from ..model.torque_model import Model
+from ..search.regressors import RegressorCandidate
 from ..statistics.baselines import explained_share, torque_variance
 from ..statistics.confidence import Intervals
 from ..statistics.criterion import SIGNIFICANCE_LEVEL, WHITENESS_LEVEL, normality_p_values, whiteness_p_values
@@ -60,7 +61,7 @@ class SelectedEffect:
     Attributes:
         gain: Mean squared error without the effect, all else refitted, minus that with it, N^2 m^2.
         p_value: p-value of the score test.
-        indistinguishable: Names of laws that explain the log equally well.
+        indistinguishable: Names of effects that explain the log equally well.
     """
 
     gain: float
@@ -74,9 +75,9 @@ class Evidence:
 
     Attributes:
         effects: Evidence for each effect of the corrected model, in the same order.
-        rejected: Rejected laws: name, gain on the selection rows (N^2 m^2), reason.
+        rejected: Rejected effects: name, gain on the selection rows (N^2 m^2), reason.
         is_white: Whether the residual is indistinguishable from white noise.
-        correlates: Signals that a structured residual correlates with, if no term does.
+        correlates: Signals that a structured residual correlates with, if no regressor does.
     """
 
     effects: tuple[SelectedEffect, ...]
@@ -138,12 +139,12 @@ class Outcome:
         return self.after.model.predictive().predict()
 
     @property
-    def term_effects(self) -> list[tuple[int, AppliedEffect]]:
-        """Regressors of named signals, each with its index among the effects."""
+    def regressors(self) -> list[tuple[int, AppliedEffect, RegressorCandidate]]:
+        """Regressors of named signals: index among the effects, effect, and its form."""
         return [
-            (k, effect)
+            (k, effect, effect.candidate)
             for k, effect in enumerate(self.after.model.effects)
-            if isinstance(effect.law, SignalTerm)
+            if isinstance(effect.candidate, RegressorCandidate)
         ]
 
 
@@ -234,9 +235,11 @@ def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[
         normality_p_values(residual, parts.all_rows),
     )
     coloured = p < WHITENESS_LEVEL
-    names = [name for _, one in o.term_effects for name in one.law.input_signals]  # type: ignore[attr-defined]
+    names = [name for _, _, one in o.regressors for name in one.input_signals]
     joints = (
-        np.any([one.active for _, one in o.term_effects], axis=0) if names else np.zeros(len(coloured), bool)
+        np.any([effect.active for _, effect, _ in o.regressors], axis=0)
+        if names
+        else np.zeros(len(coloured), bool)
     )
     removable = before - floor
     structured = bool(names) or not o.evidence.is_white
@@ -253,7 +256,7 @@ def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[
 def _unconfirmed_warnings(o: Outcome) -> list[str]:
     """Warnings about effects that are not significant on the reported rows."""
     return [
-        f"{effect.law.name} is not confirmed by the reported rows (p = {evidence.p_value:.2g} there)"
+        f"{effect.candidate.name} is not confirmed by the reported rows (p = {evidence.p_value:.2g} there)"
         for effect, evidence in zip(o.after.model.effects, o.evidence.effects, strict=True)
         if evidence.p_value > SIGNIFICANCE_LEVEL
     ]
@@ -318,34 +321,34 @@ def _effect_entries(o: Outcome) -> list[dict[str, Any]]:
         for evidence, effect, half in zip(
             o.evidence.effects, o.after.all_rows.effects, o.half_widths.effects, strict=True
         )
-        if not isinstance(effect.law, SignalTerm)
+        if not isinstance(effect.candidate, RegressorCandidate)
     ]
-    if o.term_effects:
-        found.append(_terms_entry(o, joints))
+    if o.regressors:
+        found.append(_regressors_entry(o, joints))
     return found
 
 
-def _terms_entry(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
+def _regressors_entry(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
     """Entry of the report for all regressors of named signals."""
-    ranked = sorted(o.term_effects, key=lambda pair: -o.evidence.effects[pair[0]].gain)
-    acts = np.any([effect.active for _, effect in ranked], axis=0)
+    ranked = sorted(o.regressors, key=lambda one: -o.evidence.effects[one[0]].gain)
+    acts = np.any([effect.active for _, effect, _ in ranked], axis=0)
     return {
-        "name": TERMS,
+        "name": LEARNED_RESIDUAL,
         "joints": acting_joints(acts, joints),
         "params": {},
         "indistinguishable": [],
-        "heldout_gain": sum(o.evidence.effects[k].gain for k, _ in ranked),
-        "p_value": min(o.evidence.effects[k].p_value for k, _ in ranked),
-        "inputs": list(dict.fromkeys(name for _, effect in ranked for name in effect.law.input_signals)),  # type: ignore[attr-defined]
+        "heldout_gain": sum(o.evidence.effects[k].gain for k, _, _ in ranked),
+        "p_value": min(o.evidence.effects[k].p_value for k, _, _ in ranked),
+        "inputs": list(dict.fromkeys(name for _, _, one in ranked for name in one.input_signals)),
         "terms": [
             {
-                "kind": effect.law.shape.kind,  # type: ignore[attr-defined]
-                "inputs": list(effect.law.input_signals),  # type: ignore[attr-defined]
-                "at": effect.law.at,
+                "kind": one.effect.shape.kind,
+                "inputs": list(one.input_signals),
+                "at": one.at,
                 "joints": acting_joints(effect.active, joints),
                 "heldout_gain": o.evidence.effects[k].gain,
             }
-            for k, effect in ranked
+            for k, effect, one in ranked
         ],
     }
 
@@ -353,21 +356,21 @@ def _terms_entry(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
 def _effect_entry(
     evidence: SelectedEffect, effect: AppliedEffect, half: Array, joints: Sequence[str]
 ) -> dict[str, Any]:
-    """Entry of the report for one law."""
-    settings = law_settings(effect)
+    """Entry of the report for one effect."""
+    settings = effect_settings(effect)
     entry: dict[str, Any] = {
-        "name": effect.law.name,
+        "name": effect.candidate.name,
         "joints": acting_joints(effect.active, joints),
         "params": parameter_entries(effect, half),
         "indistinguishable": list(evidence.indistinguishable),
         "heldout_gain": evidence.gain,
         "p_value": evidence.p_value,
-        **effect.law.record_statistics(),
+        **effect.candidate.record_statistics(),
     }
     if settings:
         entry["form"] = settings
     if evidence.indistinguishable:
-        entry["separated_by"] = effect.law.motion
+        entry["separated_by"] = effect.candidate.motion
     return entry
 
 
@@ -399,12 +402,12 @@ def _shapes(o: Outcome) -> tuple[Shape, ...]:
     found = []
     for effect in o.after.model.effects:
         for j in np.flatnonzero(effect.active)[:3]:
-            x, unit = _signal_series(o, effect.law.signal, int(j))
+            x, unit = _signal_series(o, effect.candidate.signal, int(j))
             found.append(
                 Shape(
-                    effect=effect.law.name,
+                    effect=effect.candidate.name,
                     joint=samples.joints[j],
-                    signal=effect.law.signal,
+                    signal=effect.candidate.signal,
                     unit=unit,
                     x=x[rows],
                     before=before[rows, j],

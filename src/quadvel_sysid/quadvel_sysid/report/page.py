@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from quadvel_actuator.effects.terms import LEARNED_RESIDUAL
+from quadvel_actuator.effects.basis_regressors import LEARNED_RESIDUAL
 
 from ..excitation import propose
 from . import figures
@@ -148,7 +148,7 @@ def _candidates(report: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _placement_text(effect: Mapping[str, Any], joints: Sequence[str]) -> str:
-    """Where an effect was added, and which laws are indistinguishable from it."""
+    """Where an effect was added, and which effects are indistinguishable from it."""
     where = (
         "all joints"
         if len(effect["joints"]) == len(joints)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
+from quadvel_actuator.effects.basis_regressors import LEARNED_RESIDUAL
 
 from ..statistics.criterion import SIGNIFICANCE_LEVEL
 
@@ -57,7 +57,7 @@ def _effects_text(report: Mapping[str, Any]) -> str:
     cut = 100.0 * (1.0 - after / before) if before > 0.0 else 0.0
     way = f"{'falls' if cut >= 0.0 else 'rises'} by {abs(cut):.0f} %"
     text = f"Add {named}: the held-out error {way}, from {before:.3g} to {after:.3g} N^2 m^2"
-    learned = any(one["name"] == TERMS for one in effects)
+    learned = any(one["name"] == LEARNED_RESIDUAL for one in effects)
     beyond = "the learned remainder" if learned else "the residual"
     more = f"; {beyond} depends on {', '.join(rest['depends_on'])}" if rest["depends_on"] else ""
     for one in effects:

@@ -11,9 +11,10 @@ import numpy as np
 from quadvel_description.arrays import Array, Indices
 
 from ..data.split import DataSplit
+from ..model.applied_effect import AppliedEffect
 from ..model.fit import fit, fit_delay_profile
-from ..model.torque_model import AppliedEffect, Model
-from ..options import DEVICES, Devices
+from ..model.torque_model import Model
+from ..options import SEARCH_DEFAULTS, SearchOptions
 from ..parallel import parallel_map
 from ..statistics.criterion import (
     PENALTY_PER_PARAMETER,
@@ -24,7 +25,6 @@ from ..statistics.criterion import (
     normality_p_values,
     whiteness_p_values,
 )
-from .library import complexity
 
 _VARIANCE_FLOOR = 1e-12
 """Added to variances, N^2 m^2, for logs without noise."""
@@ -64,7 +64,7 @@ class FittedModel:
         """
         return float(
             np.log((self.selection_mse + _VARIANCE_FLOOR) / (self.evaluator.noise + _VARIANCE_FLOOR)).sum()
-        ) + PENALTY_PER_PARAMETER * parameter_count(self.model, self.evaluator.devices.memory_cost)
+        ) + PENALTY_PER_PARAMETER * parameter_count(self.model, self.evaluator.options.memory_cost)
 
     def compare_with(self, before: FittedModel) -> Comparison:
         """Compare with another fitted model on the selection rows.
@@ -84,7 +84,7 @@ class FittedModel:
         """Whether the residual on the fitted and selection rows passes as white noise."""
         parts, samples = self.evaluator.parts, self.model.samples
         p = whiteness_p_values(self.residual, parts.fit_or_select, samples.start, parts.noise_overlap)
-        if self.evaluator.devices.kurtosis_test:
+        if self.evaluator.options.kurtosis_test:
             p = np.minimum(p, normality_p_values(self.residual, parts.fit_or_select))
         return bool((p * 2 * len(p) > WHITENESS_LEVEL).all())
 
@@ -99,14 +99,14 @@ def parameter_count(model: Model, memory_cost: float) -> float:
 
     Args:
         model: The model.
-        memory_cost: Further parameters that a law with memory counts as.
+        memory_cost: Further parameters that an effect with memory, or one like a delay, counts as.
 
     Returns:
-        Number of parameters; values shared by joints count once, see `library.complexity`.
+        Number of parameters; values shared by joints count once, see `EffectCandidate.complexity`.
     """
     total = 2.0 * (len(np.unique(model.gain_groups)) + len(np.unique(model.delay_groups)) - 2)
     for effect in model.effects:
-        total += complexity(effect.law, memory_cost) * len(np.unique(effect.groups[effect.active]))
+        total += effect.candidate.complexity(memory_cost) * len(np.unique(effect.groups[effect.active]))
     return total
 
 
@@ -118,13 +118,13 @@ class ModelEvaluator:
         parts: Data split.
         noise: Variance of the torque noise, (J,), N^2 m^2.
         cores: Worker processes.
-        devices: Devices of the search.
+        options: Options of the search.
     """
 
     parts: DataSplit
     noise: Array
     cores: int = 1
-    devices: Devices = DEVICES
+    options: SearchOptions = SEARCH_DEFAULTS
 
     def fit(self, model: Model) -> FittedModel:
         """Fit a model to the fitted rows.
@@ -164,7 +164,7 @@ class ModelEvaluator:
         """
         return min(
             fitted,
-            FittedModel(fit_delay_profile(fitted.model, self.parts.fit, self.cores, self.devices), self),
+            FittedModel(fit_delay_profile(fitted.model, self.parts.fit, self.cores, self.options), self),
             key=lambda one: one.criterion,
         )
 
@@ -179,11 +179,11 @@ class ModelEvaluator:
             `fitted` or the model with the effect on fewer joints.
         """
         effect = fitted.model.effects[index]
-        if effect.law.all_joints_together:
+        if effect.candidate.all_joints_together:
             return fitted
         without = FittedModel(fitted.model.without_effect(index), self)
         comparison = fitted.compare_with(without)
-        cost = PENALTY_PER_PARAMETER * complexity(effect.law, self.devices.memory_cost)
+        cost = PENALTY_PER_PARAMETER * effect.candidate.complexity(self.options.memory_cost)
         needed = (
             effect.active
             & (comparison.joint_p_values < SIGNIFICANCE_LEVEL)

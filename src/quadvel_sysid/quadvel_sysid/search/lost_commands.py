@@ -14,13 +14,16 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from quadvel_actuator.effects.commands import MAX_BACKLOG, CommandHold
 from quadvel_description.arrays import Array, Bools, Indices
 
 from ..data.split import DataSplit
+from ..model.applied_effect import AppliedEffect
 from ..model.fit import fit, squared_error
-from ..model.torque_model import AppliedEffect, Model
+from ..model.torque_model import Model
+from .effect_candidates.commands import CommandHoldCandidate, InferredCommandLoss
 
+MAX_BACKLOG = 6
+"""Largest number of commands lost in a row that is considered."""
 SUSPICION_NATS = 6.0
 """nats of log likelihood by which a command looks lost or late on its own."""
 _MIN_LOST_SHARE = 0.003
@@ -145,8 +148,10 @@ def lost_commands(
 def _with_losses(model: Model, odds: Array, usual: Array, parts: DataSplit) -> Model:
     """Add losses with these probabilities to the model and fit it."""
     every = np.ones(odds.shape[1], dtype=bool)
-    law = CommandHold(_expand_rows(odds, model.samples.row), usual)
-    one = AppliedEffect(law, every, np.full((1, len(every)), 0.05), np.arange(len(every)))
+    loss = InferredCommandLoss(_expand_rows(odds, model.samples.row), usual)
+    one = AppliedEffect(
+        CommandHoldCandidate(loss), every, np.full((1, len(every)), 0.05), np.arange(len(every))
+    )
     return fit(model.with_effect(one), parts.fit, 3)
 
 
@@ -183,10 +188,10 @@ def reassign_losses(model: Model, parts: DataSplit, noise: Array) -> Model:
         The model with new probabilities of its losses.
     """
     for k, one in enumerate(model.effects):
-        if isinstance(one.law, CommandHold):
+        if isinstance(one.candidate, CommandHoldCandidate):
             odds = backlog_probabilities(model.without_effect(k), noise, MAX_BACKLOG, ~parts.fit)
-            law = CommandHold(odds, odds[parts.fit].mean(axis=0))
-            model = model.with_replaced_effect(k, attrs.evolve(one, law=law))
+            loss = InferredCommandLoss(odds, odds[parts.fit].mean(axis=0))
+            model = model.with_replaced_effect(k, attrs.evolve(one, candidate=CommandHoldCandidate(loss)))
     return model
 
 

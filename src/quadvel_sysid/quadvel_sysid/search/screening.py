@@ -1,28 +1,31 @@
 """Screening of candidate effects: a linearised score test, profiled over a grid of delays.
 
 A missing effect biases the gains and delays that were fitted without it. At each grid point the
-model is linear in the gains, in small changes of the delays, and in the weights of the laws. Their
+model is linear in the gains, in small changes of the delays, and in the weights of the effects. Their
 columns are projected out of the residual and of the candidate's regressors (Frisch, Waugh and
 Lovell). The reduction of the squared error by the projected regressors gives the candidate's score.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 
 import attrs
 import numpy as np
 
-from quadvel_actuator.effects import EffectLaw, Stage
-from quadvel_description.arrays import Array
+from quadvel_description.arrays import Array, Indices
 
-from ..data.signals import scattered_rows
+from ..data.signals import Samples, scattered_rows
+from ..model.applied_effect import AppliedEffect
+from ..model.effect_candidate import EffectCandidate
 from ..model.fit import RIDGE
-from ..model.torque_model import MAX_DELAYS_S, AppliedEffect, Model, Unknowns, jacobian, linear_columns
+from ..model.jacobian import Unknowns, jacobian
+from ..model.torque_model import MAX_DELAYS_S, Model
 from ..parallel import parallel_map
 from ..statistics.criterion import PENALTY_PER_PARAMETER
-from .library import Context, SignalTerm, allowed_joints, complexity
+from .context import Context
+from .regressors import RegressorCandidate
 
 _TOTAL_DELAY_CHANGES_S = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004, 0.006, 0.008)
 _NO_DELAY_CHANGES_S = (0.0,)
@@ -39,7 +42,7 @@ _BATCH_SIZE = 8
 _MIN_ERROR_RATIO = 1e-3
 """Lower bound of the remaining error in the score, relative to the error before."""
 _AMPLITUDE_RANGE = (0.7, 1.4)
-"""Range of the amplitude of a nonlinear law, relative to its starting values."""
+"""Range of the amplitude of a nonlinear effect, relative to its starting values."""
 
 
 @attrs.frozen(eq=False)
@@ -55,70 +58,89 @@ class ScreenedCandidate:
     score: float
 
     @property
-    def law(self) -> EffectLaw:
-        """Law of the candidate."""
-        return self.model.effects[-1].law
+    def candidate(self) -> EffectCandidate:
+        """The candidate."""
+        return self.model.effects[-1].candidate
+
+
+@attrs.frozen(eq=False)
+class ScreeningRows:
+    """The subset of the fitted rows on which candidates are scored.
+
+    Attributes:
+        all_samples: Samples of all rows.
+        rows: Row numbers of the subset, (n,).
+        samples: Samples of the subset.
+        weight: Inverse standard deviation of the noise on fitted samples, 0 on others, (n, J), 1/(N
+            m).
+    """
+
+    all_samples: Samples
+    rows: Indices
+    samples: Samples
+    weight: Array
+
+    @classmethod
+    def of(cls, context: Context) -> ScreeningRows:
+        """Choose the rows.
+
+        Args:
+            context: Model to extend, and its data.
+
+        Returns:
+            About `_ROWS_PER_JOINT` rows.
+        """
+        fit = context.parts.fit
+        fitted = np.flatnonzero(fit.any(axis=1))
+        rows = fitted[scattered_rows(len(fitted), max(1, len(fitted) // _ROWS_PER_JOINT))]
+        weight = np.where(fit[rows], 1.0, 0.0) / np.sqrt(context.noise)
+        return cls(context.samples, rows, context.samples.take_rows(rows), weight)
 
 
 class CandidateScreening:
     """Scores candidate effects on a subset of the fitted rows.
 
-    Laws with memory are simulated over all rows, and compared on the subset.
-
-    Attributes:
-        context: Model to extend, and its data.
-        joints: Names of the joints.
-        rows: Row numbers of the subset, (n,).
-        weight: Inverse standard deviation of the noise on fitted samples, 0 on others, (n, J), 1/(N
-            m).
-        screening_rows: Samples of the subset.
+    Effects with memory are simulated over all rows, and compared on the subset.
     """
 
     def __init__(self, context: Context, cores: int = 1) -> None:
-        """Choose the rows and the grid of delays.
+        """Choose the rows and the grid of delays; the work is done on first use.
 
         Args:
             context: Model to extend, and its data.
             cores: Worker processes.
         """
-        self.context, self._cores = context, cores
-        self.joints = context.samples.joints
-        fitted = np.flatnonzero(context.parts.fit.any(axis=1))
-        self.rows = fitted[scattered_rows(len(fitted), max(1, len(fitted) // _ROWS_PER_JOINT))]
-        self.weight = np.where(context.parts.fit[self.rows], 1.0, 0.0) / np.sqrt(context.noise)
-        self.screening_rows = context.samples.take_rows(self.rows)
-        self._has_memory = any(one.law.has_memory for one in context.model.effects)
+        self._context, self._cores, self._rows = context, cores, ScreeningRows.of(context)
+        self._has_memory = any(one.candidate.has_memory for one in context.model.effects)
         shifts = _NO_DELAY_CHANGES_S if self._has_memory else _TOTAL_DELAY_CHANGES_S
-        grid = (shifts, _OUTPUT_DELAYS_S) if context.devices.screening_grid else _ONE_GRID_POINT
+        grid = (shifts, _OUTPUT_DELAYS_S) if context.options.screening_grid else _ONE_GRID_POINT
         self._grid = [context.model, *_delay_grid(context.model, *grid)]
-        self._term_points: dict[bool, DelayGridPoint] = {}
 
-    def screen_laws(self, candidates: Iterable[EffectLaw]) -> list[ScreenedCandidate]:
-        """Score laws at every point of the grid of delays.
+    def screen_effects(self, candidates: Iterable[EffectCandidate]) -> list[ScreenedCandidate]:
+        """Score effects at every point of the grid of delays.
 
         Args:
-            candidates: Laws, in all their forms.
+            candidates: Effects, in all their forms.
 
         Returns:
-            Each law at its best grid point; laws without starting values are left out.
+            Each effect at its best grid point; effects without starting values are left out.
         """
-        with_starts = [(law, table) for law in candidates if (table := self._start_values(law)) is not None]
+        with_starts = [(one, table) for one in candidates if (table := self._start_values(one)) is not None]
+        with_memory = any(one.has_memory for one, _ in with_starts)
+        grid = self._points
 
-        def solve_at(k: int) -> tuple[Array, list[tuple[Model, Array]]]:
-            points = self._grid_points(k, (law for law, _ in with_starts))
-            solutions = [points[law.has_memory].best_start(law, table) for law, table in with_starts]
-            return points[False].baseline_sse, solutions
+        def solve_at(k: int) -> list[tuple[Model, Array]]:
+            points = {False: grid[k], True: self._all_rows_point(k) if with_memory else grid[k]}
+            return [points[one.has_memory].best_start(one, table) for one, table in with_starts]
 
-        # Profile over the delays: the baseline is the best grid point without a candidate, and each
-        # law is scored at its own best grid point.
-        found = parallel_map(solve_at, len(self._grid), self._cores, self.context.samples)
-        self.baseline_sse = np.min([baseline for baseline, _ in found], axis=0)
+        # Profile over the delays: each effect is scored at its own best grid point.
+        found = parallel_map(solve_at, len(grid), self._cores, self._context.samples)
         return [
-            max((self._scored(*solution) for solution in of_law), key=lambda one: one.score)
-            for of_law in zip(*(solutions for _, solutions in found), strict=True)
+            max((self._scored(*solution) for solution in of_effect), key=lambda one: one.score)
+            for of_effect in zip(*found, strict=True)
         ]
 
-    def screen_terms(self, candidates: Sequence[SignalTerm]) -> list[ScreenedCandidate]:
+    def screen_regressors(self, candidates: Sequence[RegressorCandidate]) -> list[ScreenedCandidate]:
         """Score regressors of named signals at the delays of the model.
 
         Args:
@@ -127,76 +149,73 @@ class CandidateScreening:
         Returns:
             The scored regressors, in the same order.
         """
-        self.prepare_terms(candidates)
+        points = self._model_points  # before the map, so that its processes share them
         return parallel_map(
-            lambda k: self.screen_term(candidates[k]), len(candidates), self._cores, self.context.samples
+            lambda k: self._score(candidates[k], points),
+            len(candidates),
+            self._cores,
+            self._context.samples,
         )
 
-    def prepare_terms(self, candidates: Iterable[SignalTerm]) -> None:
-        """Compute what `screen_term` needs for a set of regressors.
+    def screen_regressor(self, candidate: RegressorCandidate) -> ScreenedCandidate:
+        """Score one regressor of a named signal at the delays of the model.
 
         Args:
-            candidates: Regressors that will be scored.
-        """
-        self._term_points = self._grid_points(0, candidates)
-        self.baseline_sse  # noqa: B018
-
-    def screen_term(self, law: SignalTerm) -> ScreenedCandidate:
-        """Score one regressor; call `prepare_terms` first.
-
-        Args:
-            law: Regressor of named signals.
+            candidate: The regressor.
 
         Returns:
             The scored regressor.
         """
-        table = np.zeros((1, law.shape.count, len(self.joints)))
-        return self._scored(*self._term_points[law.has_memory].best_start(law, table))
+        return self._score(candidate, self._model_points)
+
+    def _score(
+        self, candidate: RegressorCandidate, points: Mapping[bool, DelayGridPoint]
+    ) -> ScreenedCandidate:
+        """Score a regressor, whose weights start from 0."""
+        table = np.zeros((1, len(candidate.names), len(self._context.samples.joints)))
+        return self._scored(*points[candidate.has_memory].best_start(candidate, table))
+
+    @cached_property
+    def _model_points(self) -> dict[bool, DelayGridPoint]:
+        """The model at its own delays, by whether a candidate has memory."""
+        return {False: self._points[0], True: self._all_rows_point(0)}
+
+    @cached_property
+    def _points(self) -> list[DelayGridPoint]:
+        """The model at each point of the grid; on the subset unless its effects have memory."""
+        return [DelayGridPoint(self._rows, model, self._has_memory) for model in self._grid]
+
+    def _all_rows_point(self, k: int) -> DelayGridPoint:
+        """The model at one point of the grid, on all rows."""
+        return self._points[k] if self._has_memory else DelayGridPoint(self._rows, self._grid[k], True)
 
     @cached_property
     def baseline_sse(self) -> Array:
         """Weighted squared error (J,) of the model without a candidate, at its best delays."""
-        baselines = parallel_map(
-            lambda k: self._grid_points(k)[False].baseline_sse,
-            len(self._grid),
-            self._cores,
-            self.context.samples,
-        )
-        least: Array = np.min(baselines, axis=0)
+        least: Array = np.min([point.baseline_sse for point in self._points], axis=0)
         return least
-
-    def _grid_points(self, k: int, candidates: Iterable[EffectLaw] = ()) -> dict[bool, DelayGridPoint]:
-        """One grid point, keyed by whether a law has memory."""
-        model, on_subset = self._grid[k], attrs.evolve(self._grid[k], samples=self.screening_rows)
-        if self._has_memory:
-            return dict.fromkeys((False, True), DelayGridPoint(self, model, all_rows=True))
-        points = {False: DelayGridPoint(self, on_subset, all_rows=False)}
-        if any(law.has_memory for law in candidates):
-            points[True] = DelayGridPoint(self, model, all_rows=True)
-        return points
 
     def _scored(self, model: Model, error: Array) -> ScreenedCandidate:
         """A candidate at its best start, with the score of its squared error (J,)."""
         # Score = sum over joints of max(ln(SSE_0 / SSE) - cost, 0): the fall of the criterion.
-        law = model.effects[-1].law
-        reduction = np.maximum(self.baseline_sse - error, 0.0) * allowed_joints(law, self.joints)
+        one = model.effects[-1].candidate
+        allowed = one.allowed_joints(self._context.samples.joints)
+        reduction = np.maximum(self.baseline_sse - error, 0.0) * allowed
         ratio = 1.0 - reduction / np.maximum(self.baseline_sse, 1e-300)
         gain = -np.log(np.maximum(ratio, _MIN_ERROR_RATIO))
-        score = float(
-            np.sum(
-                np.maximum(
-                    gain - PENALTY_PER_PARAMETER * complexity(law, self.context.devices.memory_cost), 0.0
-                )
-            )
-        )
+        cost = PENALTY_PER_PARAMETER * one.complexity(self._context.options.memory_cost)
+        score = float(np.sum(np.maximum(gain - cost, 0.0)))
         return ScreenedCandidate(model, score)
 
-    def _start_values(self, law: EffectLaw) -> Array | None:
-        """Starting values (S, P, J) of a law; None if there are none."""
-        context, joints = self.context, len(self.joints)
-        starts = law.initial_guesses(context.signals, context.torque, context.residual)
+    def _start_values(self, candidate: EffectCandidate) -> Array | None:
+        """Starting values (S, P, J) of a candidate; None if there are none."""
+        context, joints = self._context, len(self._context.samples.joints)
+        starts = candidate.initial_guesses(context.signals, context.torque, context.residual)
         rows = [
-            [np.broadcast_to(one.get(p.name, p.scale), joints).clip(p.low, p.high) for p in law.parameters]
+            [
+                np.broadcast_to(one.get(p.name, p.scale), joints).clip(p.low, p.high)
+                for p in candidate.parameters
+            ]
             for one in starts
         ]
         return np.array(rows) if rows else None
@@ -216,9 +235,7 @@ class DelayGridPoint:
     """Linearised model at one pair of delays, with the columns of its own effects projected out.
 
     Attributes:
-        screening: Rows, weights and samples.
         model: The model at this pair of delays.
-        rows: Rows of the subset within the samples of `model`.
         basis: Orthonormal basis of the derivatives of the model's effects, (n, k) for each joint.
         residual: Weighted, projected residual, (J, n).
         shared_slopes: Weighted, projected derivatives along both gains and both delays, (J, 4, n).
@@ -226,21 +243,22 @@ class DelayGridPoint:
         count: Number of these unknowns.
     """
 
-    def __init__(self, screening: CandidateScreening, model: Model, all_rows: bool) -> None:
+    def __init__(self, rows: ScreeningRows, model: Model, all_rows: bool) -> None:
         """Linearise the model.
 
         Args:
-            screening: Rows, weights and samples.
+            rows: The subset on which candidates are scored.
             model: The model at this pair of delays.
-            all_rows: Whether `model` has the samples of all rows, rather than the subset alone.
+            all_rows: Whether to evaluate the model on all rows, which effects with memory need,
+                rather than on the subset alone.
         """
-        self.screening, self.model = screening, model
-        self.rows = screening.rows if all_rows else slice(None)
-        unknowns = Unknowns.of(model)
-        predicted, slopes = jacobian(model, unknowns)
-        rows, weight = self.rows, screening.weight
-        residual = (model.samples.tau - predicted)[rows] * weight  # (n, J)
-        slopes = slopes[:, :, rows] * weight.T[:, None]  # (J, A, n)
+        self._screening = rows
+        self.model = model if all_rows else attrs.evolve(model, samples=rows.samples)
+        self._rows = rows.rows if all_rows else slice(None)  # within the samples of the model
+        unknowns = Unknowns.of(self.model)
+        predicted, slopes = jacobian(self.model, unknowns)
+        residual = (self.model.samples.tau - predicted)[self._rows] * rows.weight  # (n, J)
+        slopes = slopes[:, :, self._rows] * rows.weight.T[:, None]  # (J, A, n)
 
         # Parameters of effects belong to one joint each: with an orthonormal basis B of their
         # columns every other column c becomes (I - B B') c. Gains and delays are shared by joints
@@ -280,78 +298,69 @@ class DelayGridPoint:
         """Predicted torque, (N, J), N m."""
         return self.model.predict()
 
-    def drive_torque(self, effect: AppliedEffect) -> Array:
-        """Return the input torque of an added law; cached, as every law needs it.
+    @cached_property
+    def _drive_torque(self) -> Array:
+        """Torque of the drive, (N, J), N m."""
+        return self.model.drive_torque()
+
+    def regressors(self, candidate: EffectCandidate, table: Array) -> Array:
+        """Compute the weighted regressors of a candidate at its starting values.
+
+        An added effect has one regressor per linear parameter. Others have a single one, the change
+        of the torque that they cause.
 
         Args:
-            effect: The effect.
-
-        Returns:
-            Torque, (N, J), N m.
-        """
-        if effect.reads_total_torque:
-            return self.model.drive_torque(effect)
-        if not hasattr(self, "_x"):
-            self._x = self.model.drive_torque(effect)
-        return self._x
-
-    def regressors(self, law: EffectLaw, table: Array) -> Array:
-        """Compute the weighted regressors of a law at its starting values.
-
-        An added law has one regressor per linear parameter. Other laws have a single one, the
-        change of the torque that they cause.
-
-        Args:
-            law: The candidate.
+            candidate: The candidate.
             table: Starting values, (S, P, J).
 
         Returns:
             Regressors, (S, J, L, n).
         """
         joints = self.residual.shape[0]
-        all_joints = np.ones(joints, dtype=bool)
         found = []
-        model, groups = self.model, np.arange(joints)
-        if law.stage == Stage.ADDED:
+        model, every, groups = self.model, np.ones(joints, dtype=bool), np.arange(joints)
+        if candidate.linear:
             # Regressors phi_l of tau = ... + sum_l w_l phi_l, at the starts of the other
             # parameters.
-            x, rows = self.drive_torque(AppliedEffect(law, all_joints, table[0], groups)), self.rows
-            if len(x) > len(self.screening.rows) and not law.has_memory:
+            x, rows = self._drive_torque, self._rows
+            if candidate.reads_total_torque:
+                x = model.input_torque(candidate)
+            if len(x) > len(self._screening.rows) and not candidate.has_memory:
                 x, rows = x[rows], slice(None)
-                model = attrs.evolve(model, samples=self.screening.screening_rows)
+                model = attrs.evolve(model, samples=self._screening.samples)
             for values in table:
-                effect = AppliedEffect(law, all_joints, values, groups)
-                found.append(linear_columns(model, effect, x)[:, rows].transpose(2, 0, 1))
+                effect = AppliedEffect(candidate, every, values, groups)
+                found.append(model.linear_columns(effect, x)[:, rows].transpose(2, 0, 1))
         else:
-            # d tau = tau(with the law at its start) - tau, for an amplitude of 1.
+            # d tau = tau(with the effect at its start) - tau, for an amplitude of 1.
             base = self.torque
             for first in range(0, len(table), _BATCH_SIZE):
                 values = table[first : first + _BATCH_SIZE]
-                extended = model.with_effect(AppliedEffect(law, all_joints, values[0], groups))
+                extended = model.with_effect(AppliedEffect(candidate, every, values[0], groups))
                 batch = [np.repeat(effect.values[None], len(values), axis=0) for effect in model.effects]
                 torque = extended.evaluate(
                     np.repeat(model.gains[None], len(values), axis=0), [*batch, values]
                 )
-                found += list((torque - base)[:, self.rows].transpose(0, 2, 1)[:, :, None])
-        return np.stack(found) * self.screening.weight.T[None, :, None]
+                found += list((torque - base)[:, self._rows].transpose(0, 2, 1)[:, :, None])
+        return np.stack(found) * self._screening.weight.T[None, :, None]
 
-    def best_start(self, law: EffectLaw, table: Array) -> tuple[Model, Array]:
-        """Find the best starting values of a law on each joint.
+    def best_start(self, candidate: EffectCandidate, table: Array) -> tuple[Model, Array]:
+        """Find the best starting values of a candidate on each joint.
 
         Args:
-            law: The candidate.
+            candidate: The candidate.
             table: Starting values, (S, P, J).
 
         Returns:
-            Model with the law at its best start, and the remaining weighted squared error (J,).
+            Model with the candidate at its best start, and the remaining weighted squared error (J,).
         """
-        regressors = self.regressors(law, table)
+        regressors = self.regressors(candidate, table)
         projected = np.stack([self.project_out(one) for one in regressors])
-        error, choice, (change, weights) = self._solve(projected, law, getattr(law, "penalty", None))
-        return self._model_at_start(law, table, choice, change, weights), error
+        error, choice, (change, weights) = self._solve(projected, candidate)
+        return self._model_at_start(candidate, table, choice, change, weights), error
 
     def _solve(
-        self, columns: Array, law: EffectLaw | None, penalty: Array | None = None
+        self, columns: Array, candidate: EffectCandidate | None
     ) -> tuple[Array, Array, tuple[Array, Array]]:
         """Solve the linear least-squares problem of each joint and start.
 
@@ -362,6 +371,7 @@ class DelayGridPoint:
         # C (L, n) and weights w of the candidate, and the derivatives S (4, n) and changes b of
         # gains and delays. cc, cr, cs, ss and sr are the products C C', C r, C S', S S' and S r.
         joints, size = columns.shape[1:3]
+        penalty = None if candidate is None else candidate.penalty
         cc = columns @ columns.swapaxes(-1, -2)
         scale = np.einsum("sjll->sj", cc)[..., None, None] / max(size, 1)
         ridge = 1e-8 * np.eye(size) if penalty is None else RIDGE * penalty
@@ -394,20 +404,20 @@ class DelayGridPoint:
                 + np.einsum("kj,sjkm,mj->sj", change, hessian, change)
             )
             # Clipping the weights by v raises the error by v'cc v, as w was the minimum.
-            bounded = self._bounded(law, weights)
+            bounded = self._bounded(candidate, weights)
             clipped = weights - bounded
             shared_error = shared_error + np.einsum("sjl,sjlm,sjm->sj", clipped, cc, clipped)
             choice = np.argmin(shared_error, axis=0)
         return shared_error[choice, joint], choice, (change, bounded[choice, joint])
 
-    def _bounded(self, law: EffectLaw | None, weights: Array) -> Array:
+    def _bounded(self, candidate: EffectCandidate | None, weights: Array) -> Array:
         """Clip weights (S, J, L) to the parameter bounds, or to the amplitude range."""
-        if law is None:
+        if candidate is None:
             return weights
-        if law.stage != Stage.ADDED:
+        if not candidate.linear:
             return weights.clip(*_AMPLITUDE_RANGE)
-        bounds = {p.name: (p.low, p.high) for p in law.parameters}
-        low, high = np.array([bounds[name] for name in law.linear]).T  # type: ignore[attr-defined]
+        bounds = {p.name: (p.low, p.high) for p in candidate.parameters}
+        low, high = np.array([bounds[name] for name in candidate.linear]).T
         return weights.clip(low, high)
 
     def _shared_change(self, hessian: Array, gradient: Array) -> Array:
@@ -430,20 +440,19 @@ class DelayGridPoint:
         return shared
 
     def _model_at_start(
-        self, law: EffectLaw, table: Array, choice: Array, change: Array, weights: Array
+        self, candidate: EffectCandidate, table: Array, choice: Array, change: Array, weights: Array
     ) -> Model:
-        """The model with the law at the selected starts and with changed gains and delays."""
-        model, joint = self.model, np.arange(table.shape[2])
+        """The model with the candidate at the selected starts and with changed gains and delays."""
+        model, joint, all_samples = self.model, np.arange(table.shape[2]), self._screening.all_samples
         values = table[choice, :, joint].T.copy()
-        if law.stage == Stage.ADDED:
-            linear = [law.names.index(name) for name in law.linear]  # type: ignore[attr-defined]
-            values[linear] = weights.T
-        groups = np.zeros(len(joint), dtype=np.intp) if law.shared_by_joints else joint
-        effect = AppliedEffect(law, allowed_joints(law, self.screening.joints), values, groups)
+        if candidate.linear:
+            values[[candidate.names.index(name) for name in candidate.linear]] = weights.T
+        groups = np.zeros(len(joint), dtype=np.intp) if candidate.shared_by_joints else joint
+        effect = AppliedEffect(candidate, candidate.allowed_joints(all_samples.joints), values, groups)
         moved = attrs.evolve(model, gains=np.maximum(model.gains + change[:2], 0.0)).with_delays(
             model.delays + change[2:]
         )
-        return attrs.evolve(moved.with_effect(effect), samples=self.screening.context.samples)
+        return attrs.evolve(moved.with_effect(effect), samples=all_samples)
 
 
 def _ridge_solve(hessian: Array, gradient: Array) -> Array:

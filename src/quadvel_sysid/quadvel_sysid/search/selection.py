@@ -13,23 +13,69 @@ from collections.abc import Callable, Iterable, Sequence
 import attrs
 import numpy as np
 
-from quadvel_actuator.effects import EffectLaw
 from quadvel_description.arrays import Array
 
-from ..model.torque_model import AppliedEffect, Model
+from ..model.applied_effect import AppliedEffect
+from ..model.effect_candidate import EffectCandidate
+from ..model.torque_model import Model
 from ..statistics.criterion import MIN_EFFECT_SIZE, SIGNIFICANCE_LEVEL
-from .candidates import LAWS, TERMS, Candidates, candidate_key
+from .candidates import EFFECTS, REGRESSORS, Candidates
 from .fitted_model import FittedModel, ModelEvaluator, joint_groupings
-from .library import SignalTerm
+from .regressors import RegressorCandidate
 
 MAX_EFFECTS = 5
 """Maximum number of effects of one log."""
 RIVAL_FRACTION = 0.5
 """Fraction of the best candidate's gain above which another candidate is its rival."""
 EQUIVALENCE_MARGIN = 0.02
-"""Relative difference of a joint's error below which two laws are indistinguishable."""
+"""Relative difference of a joint's error below which two effects are indistinguishable."""
 
 ProgressText = Callable[[str], None]
+
+
+@attrs.frozen
+class SearchRecord:
+    """Candidates that a search did not choose.
+
+    Attributes:
+        rejected: Rejected effects by name: gain on the selection rows (N^2 m^2), and the reason.
+        rivals: For the key of each candidate, the keys of those that nearly equalled it.
+    """
+
+    rejected: dict[str, tuple[float, str]] = attrs.field(factory=dict)
+    rivals: dict[tuple[str, ...], set[tuple[str, ...]]] = attrs.field(factory=dict)
+
+    def add_rivals(self, before: FittedModel, candidates: Sequence[FittedModel]) -> None:
+        """Store which candidates nearly equal the best one, for `indistinguishable_effects`.
+
+        Args:
+            before: The model before.
+            candidates: Models with one change, the best one first.
+        """
+        gains = [before.criterion - candidate.criterion for candidate in candidates]
+        if gains:
+            near = {
+                one.last_effect.candidate.key
+                for one, gain in zip(candidates, gains, strict=True)
+                if len(one.model.effects) > len(before.model.effects) and gain > RIVAL_FRACTION * gains[0]
+            }
+            for key in near:
+                self.rivals.setdefault(key, set()).update(near)
+
+
+@attrs.frozen
+class SearchResult:
+    """Result of a search.
+
+    Attributes:
+        best: The best model.
+        best_effects: The best model without regressors of named signals.
+        record: Candidates that were not chosen.
+    """
+
+    best: FittedModel
+    best_effects: FittedModel
+    record: SearchRecord
 
 
 class Search:
@@ -37,60 +83,59 @@ class Search:
 
     Attributes:
         evaluator: Data that models are fitted to and compared on.
-        rejected: Rejected effects by name: gain on the selection rows (N^2 m^2), and the reason.
     """
 
     def __init__(self, evaluator: ModelEvaluator, on_progress: ProgressText = lambda text: None) -> None:
-        """Start a search.
+        """Prepare a search.
 
         Args:
             evaluator: Data that models are fitted to and compared on.
             on_progress: Receives a short text before each step.
         """
-        self.evaluator, self._devices, self._on_progress = evaluator, evaluator.devices, on_progress
-        self.rejected: dict[str, tuple[float, str]] = {}
-        self._tested_count = 1
-        self._rivals: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
+        self.evaluator, self._options, self._on_progress = evaluator, evaluator.options, on_progress
         self._candidate_cache: dict[tuple[object, ...], Candidates] = {}
 
-    def best(self, start: Model) -> tuple[FittedModel, FittedModel]:
+    def best(self, start: Model) -> SearchResult:
         """Find the model with the lowest criterion.
 
-        The search ends at once where the plain model leaves a white residual. Up to two laws
-        compete with one regressor of named signals. If two laws leave a structured residual, the
+        The search ends at once where the plain model leaves a white residual. Up to two effects
+        compete with one regressor of named signals. If two effects leave a structured residual, the
         search tries regressors alone. If these leave structure too, or cost more, it tries further
-        laws, and regressors on top.
+        effects, and regressors on top.
 
         Args:
             start: The plain EAM.
 
         Returns:
-            The best model, and the best model without regressors of named signals.
+            The best model, the best one without regressors of named signals, and what was not
+            chosen.
         """
+        record = SearchRecord()
         plain = self.evaluator.refine_delays(self.evaluator.fit(start))
         if plain.is_white:
-            return plain, plain
-        # One law that leaves white noise needs no comparison.
-        laws = self.extend(plain, LAWS, most=1)
-        if laws.is_white:
-            laws = self.prune(laws)
-            return laws, laws
-        # Otherwise up to two laws compete with one regressor of named signals.
-        terms = self.extend(plain, TERMS, most=1)
-        laws = self.extend(laws, LAWS, most=2, bound=terms.criterion)
-        if not laws.is_white:
-            terms = self.extend(terms, TERMS)
-        models = [terms]
-        if laws.is_white or not terms.is_white or laws.criterion < terms.criterion:
-            laws = self.prune(self.extend(laws, LAWS, bound=terms.criterion))
-            models += [laws] if laws.is_white else [laws, self.extend(laws, TERMS, bound=terms.criterion)]
+            return SearchResult(plain, plain, record)
+        # One effect that leaves white noise needs no comparison.
+        effects = self.extend(plain, EFFECTS, record, most=1)
+        if effects.is_white:
+            effects = self.prune(effects)
+            return SearchResult(effects, effects, record)
+        # Otherwise up to two effects compete with one regressor of named signals.
+        regressors = self.extend(plain, REGRESSORS, record, most=1)
+        effects = self.extend(effects, EFFECTS, record, most=2, bound=regressors.criterion)
+        if not effects.is_white:
+            regressors = self.extend(regressors, REGRESSORS, record)
+        models, bound = [regressors], regressors.criterion
+        if effects.is_white or not regressors.is_white or effects.criterion < bound:
+            effects = self.prune(self.extend(effects, EFFECTS, record, bound=bound))
+            models.append(effects)
+            if not effects.is_white:
+                models.append(self.extend(effects, REGRESSORS, record, bound=bound))
         # Among models with nearly equal criteria the one with the fewest regressors counts.
-        if not self._devices.laws_before_terms:
-            return self.prune(min(models, key=lambda one: one.criterion)), laws
         least = min(one.criterion for one in models)
         margin = EQUIVALENCE_MARGIN * len(self.evaluator.noise)
         equivalent = [one for one in models if one.criterion < least + margin]
-        return self.prune(min(equivalent, key=_term_count)), laws
+        key = _regressor_count if self._options.effects_before_regressors else _criterion
+        return SearchResult(self.prune(min(equivalent, key=key)), effects, record)
 
     def residual_correlates(self, fitted: FittedModel) -> tuple[str, ...]:
         """Return the signals that the residual correlates with most.
@@ -101,9 +146,9 @@ class Search:
         Returns:
             Names of signals, even if a regressor of them would not pay for its parameters.
         """
-        terms, _ = self._candidates_of(fitted).fitted_candidates(TERMS)
-        best = min(terms, key=lambda one: one.criterion, default=None)
-        return () if best is None else best.last_effect.law.input_signals  # type: ignore[attr-defined]
+        found = self._candidates_of(fitted).fitted_candidates(REGRESSORS).models
+        best = min(found, key=lambda one: one.criterion, default=None)
+        return () if best is None else best.last_effect.candidate.key
 
     def prune(self, fitted: FittedModel) -> FittedModel:
         """Simplify a model: fewer effects and joints, special cases, shared values and gains.
@@ -149,22 +194,27 @@ class Search:
         )
 
     def _replace_by_special_case(self, fitted: FittedModel, index: int) -> FittedModel:
-        """Replace a law by its special case (Stribeck by Coulomb friction), unless rows need it."""
-        if not self._devices.special_cases:
+        """Replace an effect by its special case (Stribeck by Coulomb friction), unless rows need it."""
+        if not self._options.special_cases:
             return fitted
         effect = fitted.model.effects[index]
-        special_case = effect.law.special_case(dict(zip(effect.law.names, effect.values, strict=True)))
+        special_case = effect.candidate.special_case(effect.parameters)
         if special_case is None:
             return fitted
-        law, start = special_case
-        values = np.array([start[name] for name in law.names])
+        candidate, start = special_case
+        values = np.array([start[name] for name in candidate.names])
         simpler = self.evaluator.fit(
-            fitted.model.with_replaced_effect(index, attrs.evolve(effect, law=law, values=values))
+            fitted.model.with_replaced_effect(index, attrs.evolve(effect, candidate=candidate, values=values))
         )
         return fitted if self._is_needed(simpler, fitted) else simpler
 
     def extend(
-        self, best: FittedModel, kinds: str, most: int = MAX_EFFECTS, bound: float = np.inf
+        self,
+        best: FittedModel,
+        kinds: str,
+        record: SearchRecord,
+        most: int = MAX_EFFECTS,
+        bound: float = np.inf,
     ) -> FittedModel:
         """Add candidates while that lowers the criterion.
 
@@ -173,7 +223,8 @@ class Search:
 
         Args:
             best: Model to extend.
-            kinds: `candidates.LAWS` or `candidates.TERMS`.
+            kinds: `candidates.EFFECTS` or `candidates.REGRESSORS`.
+            record: Receives the candidates that are not chosen.
             most: Maximum number of effects.
             bound: Criterion that the result has to reach; the search stops when it cannot.
 
@@ -182,7 +233,7 @@ class Search:
         """
         while len(best.model.effects) < most and not best.is_white:
             self._on_progress(f"effect {len(best.model.effects) + 1}")
-            before, more = best, self._add_best(best, kinds)
+            before, more = best, self._add_best(best, kinds, record)
             if more is None:
                 break
             best = self.evaluator.refine_delays(self.eliminate(more, kept=1))
@@ -192,46 +243,35 @@ class Search:
                 break
         return best
 
-    def _add_best(self, before: FittedModel, kinds: str) -> FittedModel | None:
+    def _add_best(self, before: FittedModel, kinds: str, record: SearchRecord) -> FittedModel | None:
         """The model with the best candidate added; None if no candidate passes the test."""
-        candidates = [*self._candidates(before, kinds), *self._finer_groupings(before)]
+        fitted = self._candidates_of(before).fitted_candidates(kinds)
+        candidates = [*fitted.models, *self._finer_groupings(before)]
         candidates.sort(key=lambda one: one.criterion)
-        self._record_rivals(before, candidates)
+        record.add_rivals(before, candidates)
         for candidate in candidates:
-            reason = self._rejection_reason(before, candidate)
+            reason = self._rejection_reason(before, candidate, fitted.tested_count)
             if not reason:
                 return candidate
             if len(candidate.model.effects) > len(before.model.effects):
-                self.rejected.setdefault(
-                    candidate.last_effect.law.name, (candidate.compare_with(before).gain, reason)
-                )
+                gain = candidate.compare_with(before).gain
+                record.rejected.setdefault(candidate.last_effect.candidate.name, (gain, reason))
         return None
 
-    def _record_rivals(self, before: FittedModel, candidates: Sequence[FittedModel]) -> None:
-        """Store which candidates nearly equal the best one, for `indistinguishable_effects`."""
-        gains = [before.criterion - candidate.criterion for candidate in candidates]
-        if gains:
-            near = {
-                candidate_key(candidate.last_effect.law)
-                for candidate, gain in zip(candidates, gains, strict=True)
-                if len(candidate.model.effects) > len(before.model.effects)
-                and gain > RIVAL_FRACTION * gains[0]
-            }
-            for name in near:
-                self._rivals.setdefault(name, set()).update(near)
-
-    def _rejection_reason(self, before: FittedModel, after: FittedModel) -> str:
+    def _rejection_reason(self, before: FittedModel, after: FittedModel, tested_count: int) -> str:
         """Reason why an added effect is rejected; empty if it is accepted."""
         grown = len(after.model.effects) > len(before.model.effects)
-        if grown and self._devices.no_repeats and duplicates_effect(after.last_effect, before.model.effects):
-            return "the same joints already have a law that is its special or its general case"
+        if grown and self._options.no_repeats and duplicates_effect(after.last_effect, before.model.effects):
+            return "the same joints already have an effect that is its special or its general case"
         if grown and not after.last_effect.is_excited(after.model.signals):
-            return "the joints moved too little to distinguish it from other laws"
+            return "the joints moved too little to distinguish it from other effects"
         comparison = after.compare_with(before)
-        p = comparison.p_value * self._tested_count
+        p = comparison.p_value * tested_count
         relative_gain = float(np.max(comparison.relative_gain))
         if p >= SIGNIFICANCE_LEVEL:
-            return f"not significant on rows that select (p = {min(p, 1.0):.2g} after {self._tested_count} candidates)"
+            return (
+                f"not significant on rows that select (p = {min(p, 1.0):.2g} after {tested_count} candidates)"
+            )
         if relative_gain <= MIN_EFFECT_SIZE:
             return f"reduces the error of a joint by {100 * relative_gain:.1f} %, below {100 * MIN_EFFECT_SIZE:.0f} %"
         return "" if after.criterion < before.criterion else "its gain is below the cost of its parameters"
@@ -243,16 +283,11 @@ class Search:
             self._candidate_cache[structure] = Candidates(before)
         return self._candidate_cache[structure]
 
-    def _candidates(self, before: FittedModel, kinds: str) -> list[FittedModel]:
-        """The best candidates of these kinds on top of a model, fitted."""
-        found, self._tested_count = self._candidates_of(before).fitted_candidates(kinds)
-        return found
-
     def _finer_groupings(self, before: FittedModel) -> list[FittedModel]:
         """Models with gains, or delays, for each kind of joint and for each joint."""
         model, joints = before.model, before.model.samples.joints
         found = []
-        for groups in joint_groupings(joints) if self._devices.gains_of_each_joint else ():
+        for groups in joint_groupings(joints) if self._options.gains_of_each_joint else ():
             finer = len(np.unique(groups))
             if finer > len(np.unique(model.gain_groups)):
                 found.append(attrs.evolve(model, gain_groups=groups))
@@ -270,7 +305,7 @@ class Search:
         Returns:
             The model with the necessary effects.
         """
-        while self._devices.elimination and len(fitted.model.effects) > max(kept, 1):
+        while self._options.elimination and len(fitted.model.effects) > max(kept, 1):
             model = fitted.model
             removable = range(len(model.effects) - kept)
             reduced = min(
@@ -292,40 +327,44 @@ class Search:
             and comparison.p_value < SIGNIFICANCE_LEVEL
         )
 
-    def indistinguishable_effects(self, fitted: FittedModel, index: int) -> tuple[str, ...]:
-        """List other laws that explain the selection rows equally well in place of an effect.
+    def indistinguishable_effects(
+        self, fitted: FittedModel, index: int, record: SearchRecord
+    ) -> tuple[str, ...]:
+        """List other effects that explain the selection rows equally well in place of an effect.
 
         Args:
             fitted: A fitted model.
             index: Index of the effect.
+            record: Record of the search that found the model.
 
         Returns:
-            Names of laws whose error on every joint differs by less than `EQUIVALENCE_MARGIN`.
+            Names of effects whose error on every joint differs by less than `EQUIVALENCE_MARGIN`.
         """
-        law = fitted.model.effects[index].law
-        if isinstance(law, SignalTerm):
+        candidate = fitted.model.effects[index].candidate
+        if isinstance(candidate, RegressorCandidate):
             return ()
         rest = self.evaluator.fit(fitted.model.without_effect(index))
         alone = len(fitted.model.effects) == 1
-        pool = (
-            self._candidates_of(rest)
-            if alone
-            else Candidates(rest, self._rivals.get(candidate_key(law), set()))
-        )
+        rivals = record.rivals.get(candidate.key, set())
+        pool = self._candidates_of(rest) if alone else Candidates(rest, rivals)
         found = []
-        for other in pool.fitted_candidates(LAWS)[0]:
-            comparison = fitted.compare_with(other)
-            if (
-                other.last_effect.law.name != law.name
-                and (comparison.relative_gain < EQUIVALENCE_MARGIN).all()
-            ):
-                found.append(other.last_effect.law.name)
+        for other in pool.fitted_candidates(EFFECTS).models:
+            name = other.last_effect.candidate.name
+            gain = fitted.compare_with(other).relative_gain
+            if name != candidate.name and (gain < EQUIVALENCE_MARGIN).all():
+                found.append(name)
         return tuple(dict.fromkeys(found))
 
 
-def _term_count(fitted: FittedModel) -> tuple[int, float]:
-    """Number of regressors of named signals, then the criterion: laws are easier to interpret."""
-    return sum(isinstance(effect.law, SignalTerm) for effect in fitted.model.effects), fitted.criterion
+def _regressor_count(fitted: FittedModel) -> tuple[int, float]:
+    """Number of regressors of named signals, then the criterion: effects are easier to interpret."""
+    count = sum(isinstance(effect.candidate, RegressorCandidate) for effect in fitted.model.effects)
+    return count, fitted.criterion
+
+
+def _criterion(fitted: FittedModel) -> tuple[int, float]:
+    """The criterion alone, as a key."""
+    return 0, fitted.criterion
 
 
 def duplicates_effect(effect: AppliedEffect, others: Iterable[AppliedEffect]) -> bool:
@@ -336,26 +375,32 @@ def duplicates_effect(effect: AppliedEffect, others: Iterable[AppliedEffect]) ->
         others: Effects of the model before.
 
     Returns:
-        True if one law is the special case of the other, or the same, on all joints of `one`.
+        True if one is the special case of the other, or the same, on all joints of `effect`.
     """
-    mine = _effect_family(effect.law)
+    mine = _effect_family(effect.candidate)
     return any(
-        not (effect.active & ~other.active).any() and mine & _effect_family(other.law) for other in others
+        not (effect.active & ~other.active).any() and mine & _effect_family(other.candidate)
+        for other in others
     )
 
 
-def _effect_family(law: EffectLaw) -> set[str]:
-    """Names of a law and of its special case; empty for a regressor of named signals."""
-    if isinstance(law, SignalTerm):
+def _effect_family(candidate: EffectCandidate) -> set[str]:
+    """Names of an effect and of its special case; empty for a regressor of named signals."""
+    if isinstance(candidate, RegressorCandidate):
         return set()
-    special_case = law.special_case({p.name: np.array([p.scale]) for p in law.parameters})
-    return {law.name} | ({special_case[0].name} if special_case else set())
+    special_case = candidate.special_case({p.name: np.array([p.scale]) for p in candidate.parameters})
+    return {candidate.name} | ({special_case[0].name} if special_case else set())
 
 
 def _structure_key(model: Model) -> tuple[object, ...]:
-    """Key of a model's structure: laws, forms, joints and groups."""
+    """Key of a model's structure: effects, forms, joints and groups."""
     effects = [
-        (effect.law.name, str(effect.law.settings), effect.active.tobytes(), effect.groups.tobytes())
+        (
+            effect.candidate.name,
+            str(effect.candidate.settings),
+            effect.active.tobytes(),
+            effect.groups.tobytes(),
+        )
         for effect in model.effects
     ]
     return (*sorted(effects), model.gain_groups.tobytes(), model.delay_groups.tobytes())

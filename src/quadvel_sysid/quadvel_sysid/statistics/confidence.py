@@ -2,7 +2,7 @@
 
 The wider of two covariances counts: that of white residuals, and the sandwich estimator on cluster
 sums over all joints (Liang and Zeger), which is valid for any correlation within a cluster. Gains
-and delays are among the unknowns. Where another form of a law explains the log equally well, the
+and delays are among the unknowns. Where another form of an effect explains the log equally well, the
 interval contains its parameter values too.
 """
 
@@ -17,7 +17,8 @@ from quadvel_description.arrays import Array, Bools
 from ..data.split import DataSplit
 from ..model.delays import delay_flatness
 from ..model.fit import fit, normal_equations, squared_error
-from ..model.torque_model import MAX_DELAYS_S, Model, Unknowns
+from ..model.jacobian import Unknowns
+from ..model.torque_model import MAX_DELAYS_S, Model
 
 CONFIDENCE_LEVEL = 0.95
 """Coverage of the intervals."""
@@ -26,7 +27,7 @@ _CLOCK_ERROR_S = 0.25e-3
 _SYSTEMATIC_FRACTION, _SYSTEMATIC_GAIN_FRACTION = 0.01, 0.005
 """Systematic error relative to an effect's value, and to a gain: motion samples are noisy."""
 _EQUIVALENT_ERROR_RATIO = 1.003
-"""Ratio of squared errors below which another form of a law explains the log equally well."""
+"""Ratio of squared errors below which another form of an effect explains the log equally well."""
 
 
 @attrs.frozen(eq=False)
@@ -54,24 +55,23 @@ def intervals(model: Model, parts: DataSplit) -> Intervals:
         parts: Data split with the clusters.
 
     Returns:
-        Half widths: random error, plus the error of the law's form, plus the systematic error.
+        Half widths: random error, plus the error of the effect's form, plus the systematic error.
     """
-    # Half width = random error + error of the law's form + systematic error.
+    # Half width = random error + error of the effect's form + systematic error.
     random_error = _random_half_widths(model, parts, parts.all_rows)
     effects, first = [], 2
     for index, effect in enumerate(model.effects):
         own = random_error[first : first + len(effect.values)]
         first += len(effect.values)
-        # Some laws know the sampling error of their parameters, which replaces that of the slopes.
-        known = effect.law.sampling_error(
-            dict(zip(effect.law.names, effect.values, strict=True)), model.signals
-        )
-        sampling = np.array([known.get(name, row) for name, row in zip(effect.law.names, own, strict=True)])
+        # Some effects know the sampling error of their parameters, which replaces that of the slopes.
+        candidate = effect.candidate
+        known = candidate.sampling_error(effect.parameters, model.signals)
+        sampling = np.array([known.get(name, row) for name, row in zip(candidate.names, own, strict=True)])
         clock = np.array(
-            [[_CLOCK_ERROR_S if parameter.unit == "s" else 0.0] for parameter in effect.law.parameters]
+            [[_CLOCK_ERROR_S if parameter.unit == "s" else 0.0] for parameter in candidate.parameters]
         )
         systematic = np.maximum(clock, _SYSTEMATIC_FRACTION * np.abs(effect.values)) * effect.active
-        effects.append(sampling + _law_form_error(model, index, parts.all_rows) + systematic)
+        effects.append(sampling + _form_error(model, index, parts.all_rows) + systematic)
     # A half width as large as the gain (or 1) means that any gain from 0 on is possible.
     size = np.abs(model.gains)
     gains = np.minimum(random_error[:2] + _SYSTEMATIC_GAIN_FRACTION * size, np.maximum(1.0, size))
@@ -113,13 +113,13 @@ def _random_half_widths(model: Model, parts: DataSplit, rows: Bools) -> Array:
     return np.where(unknowns.index >= 0, half[unknowns.index], 0.0)
 
 
-def _law_form_error(model: Model, index: int, rows: Bools) -> Array:
-    """Largest change (P, J) of an effect's values under equivalent forms of its law."""
+def _form_error(model: Model, index: int, rows: Bools) -> Array:
+    """Largest change (P, J) of an effect's values under equivalent forms of it."""
     effect, change = model.effects[index], np.zeros(model.effects[index].values.shape)
-    if effect.law.indistinguishable_forms:
+    if effect.candidate.indistinguishable_forms:
         bound = _EQUIVALENT_ERROR_RATIO * squared_error(model, rows)
-        for law in effect.law.indistinguishable_forms:
-            other = fit(model.with_replaced_effect(index, attrs.evolve(effect, law=law)), rows)
+        for form in effect.candidate.indistinguishable_forms:
+            other = fit(model.with_replaced_effect(index, attrs.evolve(effect, candidate=form)), rows)
             if squared_error(other, rows) < bound:
                 change = np.maximum(change, np.abs(other.effects[index].values - effect.values))
     return change
@@ -142,10 +142,10 @@ def parameters_at_bound(model: Model) -> tuple[str, ...]:
         if (values >= most - 1e-9).any()
     ]
     for effect in model.effects:
-        for parameter, values in zip(effect.law.parameters, effect.values, strict=True):
+        for parameter, values in zip(effect.candidate.parameters, effect.values, strict=True):
             # Relative round-off of the bounds.
             reach = 1e-9 * max(abs(parameter.low), abs(parameter.high))
             at_bound = (values <= parameter.low + reach) | (values >= parameter.high - reach)
             if (at_bound & effect.active).any():
-                found.append(f"{effect.law.name}.{parameter.name}")
+                found.append(f"{effect.candidate.name}.{parameter.name}")
     return tuple(found)

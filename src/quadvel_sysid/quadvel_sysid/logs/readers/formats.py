@@ -73,7 +73,7 @@ def import_reader(path: Path, name: str) -> Any:
         return importlib.import_module(name)
     except ImportError:
         package = name.partition(".")[0]
-        what = f"needs {package}, which is not installed: pip install 'quadvel[formats]'"
+        what = f"needs {package}, which is not installed: pip install 'quadvel-core[formats]'"
         raise LogError(f"{path}: reading {path.suffix or 'it'} {what}") from None
 
 

@@ -1,4 +1,4 @@
-"""Terms of named signals: steps give the same as series; entries of files; bounds."""
+"""Basis regressors of named signals: steps give the same as series; entries of files; bounds."""
 
 from types import SimpleNamespace
 
@@ -8,7 +8,9 @@ import pytest
 from simulated_joints import NAMES, parameters
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
-from quadvel_actuator.effects.terms import Curve, Filter, Lag, Resonance, Term, Wave, load_term
+from quadvel_actuator.effects.basis_regressors import BasisRegressor
+from quadvel_actuator.effects.regressor_entries import load_regressor
+from quadvel_actuator.effects.shapes import Curve, Filter, Lag, Resonance, Wave
 
 JOINTS = NAMES[:3]
 DT = 0.001
@@ -21,11 +23,11 @@ SHAPES = {
 }
 
 
-def _term(shape, signal="q", times="", bound=50.0, seed=0, at="drive"):
+def _regressor(shape, signal="q", times="", bound=50.0, seed=0, at="drive"):
     weights = np.random.default_rng(seed).normal(size=(shape.count, 3))
     weights[:, 1] = 0.0
     bounds = np.array([bound, 0.0, bound])
-    return Term(signal, times, shape, np.array([True, False, True]), weights, bounds, at)
+    return BasisRegressor(signal, times, shape, np.array([True, False, True]), weights, bounds, at)
 
 
 def _views(n=60):
@@ -78,15 +80,15 @@ def test_a_lag_follows_a_step_as_an_exponential():
 
 @pytest.mark.parametrize("kind", SHAPES)
 @pytest.mark.parametrize(("signal", "times"), [("q", ""), ("FL_hip_joint/tau", "direction"), ("t", "tau")])
-def test_a_term_survives_its_entry_unchanged(kind, signal, times):
+def test_a_regressor_survives_its_entry_unchanged(kind, signal, times):
     names = (*JOINTS[:2], "FL_hip_joint")
     shape = SHAPES[kind] if signal == "q" else SHAPES[kind].for_columns(np.array([0]))
-    term = _term(shape, signal, times)
-    again = load_term(term.to_entry(names), names)
+    regressor = _regressor(shape, signal, times)
+    again = load_regressor(regressor.to_entry(names), names)
     tau = np.array([1.0, -2.0, 3.0])
-    memories = [one.rest(_views()[0], tau, names, DT) for one in (term, again)]
+    memories = [one.rest(_views()[0], tau, names, DT) for one in (regressor, again)]
     for view in _views():
-        for k, one in enumerate((term, again)):
+        for k, one in enumerate((regressor, again)):
             torque, memories[k] = one.advance(view, tau, names, DT, memories[k])
             if k == 0:
                 expected = torque
@@ -110,27 +112,27 @@ def test_a_term_survives_its_entry_unchanged(kind, signal, times):
 )
 def test_a_wrong_entry_is_refused_by_name(changes, said):
     with pytest.raises(ValueError, match=said):
-        load_term(_term(SHAPES["curve"]).to_entry(JOINTS) | changes, JOINTS)
+        load_regressor(_regressor(SHAPES["curve"]).to_entry(JOINTS) | changes, JOINTS)
 
 
 def _model(shape=(3,), bound=50.0, kind="filter", at="drive"):
-    entries = [_term(SHAPES[kind], bound=bound, at=at).to_entry(JOINTS)]
+    entries = [_regressor(SHAPES[kind], bound=bound, at=at).to_entry(JOINTS)]
     effect = Effect("learned_residual", (JOINTS[0], JOINTS[2]), {"terms": entries})
     truth = attrs.evolve(parameters((effect,), noise=0.0), joints=JOINTS)
     return ActuatorModel(truth, shape, DT)
 
 
 @pytest.mark.parametrize(("at", "late"), [("drive", 1), ("joint", 0)])
-def test_a_model_adds_its_terms_after_its_parameters_went_through_a_file(tmp_path, at, late):
-    """Terms in the drive pass the output delay, one step here; terms at the joint do not."""
+def test_a_model_adds_its_regressors_after_its_parameters_went_through_a_file(tmp_path, at, late):
+    """Regressors in the drive pass the output delay, one step here; regressors at the joint do not."""
     model = _model(at=at)
     model.parameters.save(tmp_path / "actuator.yaml")
     assert ActuatorParameters.load(tmp_path / "actuator.yaml") == model.parameters
     plain = ActuatorModel(attrs.evolve(model.parameters, effects=()), (3,), DT)
-    term, memory, added = _term(SHAPES["filter"]), None, []
+    regressor, memory, added = _regressor(SHAPES["filter"]), None, []
     for view in _views():
-        memory = term.rest(view, view.q, JOINTS, DT) if memory is None else memory
-        torque, memory = term.advance(view, view.q, JOINTS, DT, memory)
+        memory = regressor.rest(view, view.q, JOINTS, DT) if memory is None else memory
+        torque, memory = regressor.advance(view, view.q, JOINTS, DT, memory)
         added.append(torque)
     difference = [
         model.step(v.q, v.dq, v.q_des, 30.0, 0.5) - plain.step(v.q, v.dq, v.q_des, 30.0, 0.5)
@@ -140,12 +142,12 @@ def test_a_model_adds_its_terms_after_its_parameters_went_through_a_file(tmp_pat
 
 
 def test_an_entry_that_names_no_place_is_of_the_drive():
-    entry = _term(SHAPES["curve"]).to_entry(JOINTS)
+    entry = _regressor(SHAPES["curve"]).to_entry(JOINTS)
     del entry["at"]
-    assert load_term(entry, JOINTS).at == "drive"
+    assert load_regressor(entry, JOINTS).at == "drive"
 
 
-def test_no_term_gives_more_than_its_bound():
+def test_no_regressor_gives_more_than_its_bound():
     models = [_model(bound=0.2), _model(bound=1e-9)]
     torques = np.array([[m.step(v.q, v.dq, v.q_des, 30.0, 0.5) for v in _views()] for m in models])
     assert 0.19 < np.max(np.abs(torques[0] - torques[1])) <= 0.2 + 1e-9

@@ -1,0 +1,46 @@
+"""Parameters of the supervisor and of its parts. Knows no ROS."""
+
+from __future__ import annotations
+
+import attrs
+
+from .command_limits import JointCommandLimits
+from .guard import FALL_TIME_S, GuardConfig
+from .settings import setting
+
+MAX_STIFFNESS, MAX_DAMPING = 1000.0, 50.0
+"""N m/rad and N m s/rad; larger gains make the legs oscillate."""
+
+
+@attrs.frozen(kw_only=True)
+class SupervisorConfig:
+    """Gains and durations of the modes; limits of joint commands and guards; each is a node parameter."""
+
+    joint_limits: JointCommandLimits = JointCommandLimits()
+    guards: GuardConfig = GuardConfig()
+    auto_stand: bool = setting(False, "stand up once, automatically, as soon as the robot reports")
+    require_operator: bool = setting(False, "walk only after ~/enable_walking was called (set it on a robot)")
+    stand_kp: float = setting(
+        150.0, "gain of standing up, stance and lying down, N m/rad", at_most=MAX_STIFFNESS
+    )
+    stand_kd: float = setting(
+        4.0, "damping of standing up, stance and lying down, N m s/rad", at_most=MAX_DAMPING
+    )
+    damping_kd: float = setting(5.0, "damping when passive or in fault, N m s/rad", at_most=MAX_DAMPING)
+    fold_time: float = setting(0.8, "first part of standing up: to the lying posture, s", at_most=60.0)
+    rise_time: float = setting(1.2, "second part of standing up: to the nominal posture, s", at_most=60.0)
+    settle_time: float = setting(0.3, "from walking back to the nominal posture, s", at_most=60.0)
+    lie_down_time: float = setting(1.0, "from standing to the lying posture, s", at_most=60.0)
+    blend_time: float = setting(0.15, "over which the policy's torques fade in, s", at_most=FALL_TIME_S)
+    reset_gap: float = setting(
+        0.02, "time without a state after which the policy's memory is reset, s", at_most=FALL_TIME_S
+    )
+    max_posture_error: float = setting(
+        0.35, "largest joint error at which the robot counts as standing, rad", at_most=1.5
+    )
+    max_standing_speed: float = setting(
+        0.1, "largest speed at which walking may end in a posture, m/s", at_most=1.0
+    )
+    brake_time: float = setting(
+        0.6, "in which the policy brings the robot to a stand after a fault, s", at_most=FALL_TIME_S
+    )

@@ -1,0 +1,224 @@
+"""Guards of the legs: encoders, drives and feet. No ROS."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from typing_extensions import override
+
+from quadvel_description.arrays import Array
+from quadvel_description.robot import JOINT_NAMES, LEGS, LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
+from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
+
+from ..guard import MOVING_MODES, WALK_MODES, Guard, GuardInput, Level
+
+ENCODER_WINDOW_S = 0.1  # window in which angles and speeds of the joints must agree
+TORQUE_WINDOW_S = 0.1  # window in which commanded and reported torques must agree
+STUCK_RANGE_RAD = 0.05  # largest motion of a stuck joint
+NOTABLE_MOTION_RAD = 0.02  # motion of other joints that makes a constant sensor suspect
+
+
+class JointOutOfRange(Guard):
+    """A joint is beyond its mechanical range by more than `joint_margin`."""
+
+    @override
+    def check(self, data: GuardInput) -> str | None:
+        if data.is_sound:
+            return None
+        q = data.state.q
+        for i in np.flatnonzero(np.maximum(LOWER - q, q - UPPER) > data.config.joint_margin):
+            return f"{JOINT_NAMES[i]} is at {q[i]:.2f} rad, its range is {LOWER[i]:.2f} to {UPPER[i]:.2f}"
+        return None
+
+
+class JointTooFast(Guard):
+    """A joint moves faster than `max_joint_speed` times the speed limit of its drive."""
+
+    @override
+    def check(self, data: GuardInput) -> str | None:
+        if data.is_sound:
+            return None
+        limit = data.config.max_joint_speed * VELOCITY_LIMIT
+        for i in np.flatnonzero(np.abs(data.state.dq) > limit):
+            return f"{JOINT_NAMES[i]} moves at {data.state.dq[i]:.0f} rad/s, limit {limit[i]:.0f}"
+        return None
+
+
+class EncoderInconsistent(Guard):
+    """A joint's angle deviates from its integrated speed by more than `max_encoder_error`: a jump,
+    a slip, a constant reading, or a robot that was moved to another place.
+
+        e' = e exp(-dt / ENCODER_WINDOW_S) + (q' - q) - dt (dq' + dq) / 2
+
+    After a gap of more than 10 ms, only the part of q' - q beyond the joint's largest speed counts.
+    """
+
+    is_immediate = False
+
+    def __init__(self) -> None:
+        self._error = np.zeros(12)
+
+    @override
+    def check(self, data: GuardInput) -> str | None:
+        if data.mode not in MOVING_MODES or data.previous is None or data.gap <= 0.0 or not data.is_sound:
+            self._error[:] = 0.0
+            return None
+        motion = data.state.q - data.previous.q
+        if data.gap <= 0.01:
+            unexplained = motion - 0.5 * data.gap * (data.state.dq + data.previous.dq)
+        else:  # after a gap the path is unknown; count only motion beyond the largest speed
+            unexplained = np.sign(motion) * np.maximum(
+                np.abs(motion) - data.config.max_joint_speed * VELOCITY_LIMIT * data.gap, 0.0
+            )
+        self._error = self._error * math.exp(-data.gap / ENCODER_WINDOW_S) + unexplained
+        i = int(np.argmax(np.abs(self._error)))
+        error, limit = self._error[i], data.config.max_encoder_error
+        if abs(error) <= limit:
+            return None
+        return f"{JOINT_NAMES[i]}'s angle is {error:+.2f} rad off its integrated speed, limit {limit:.2f}"
+
+
+class EncoderFrozen(Guard):
+    """Angle and speed of a joint do not change a bit for `frozen_time`, while its target and other joints move."""
+
+    is_immediate = False
+
+    def __init__(self) -> None:
+        self._time, self._target, self._others_travel = np.zeros(12), np.zeros(12), np.zeros(12)
+
+    @override
+    def check(self, data: GuardInput) -> str | None:
+        if data.previous is None or data.command.mode == MODE_DAMPING:
+            self._time[:] = 0.0
+            return None
+        motion = np.abs(data.state.q - data.previous.q)
+        is_same = (motion == 0.0) & (data.state.dq == data.previous.dq)
+        since = is_same & (self._time > 0.0)
+        self._time = np.where(is_same, self._time + data.gap, 0.0)
+        self._target = np.where(
+            since, self._target, data.command.q
+        )  # the target when the reading last changed
+        self._others_travel = np.where(since, self._others_travel + motion.max(), 0.0)
+        suspect = (np.abs(data.command.q - self._target) > STUCK_RANGE_RAD) & (
+            self._others_travel > NOTABLE_MOTION_RAD
+        )
+        for i in np.flatnonzero(suspect & (self._time > data.config.frozen_time)):
+            return f"{JOINT_NAMES[i]}'s encoder has not changed for {1e3 * self._time[i]:.0f} ms"
+        return None
+
+
+class DriveDoesNotAnswer(Guard):
+    """A drive's torque deviates from the commanded one by more than `max_torque_error` on the mean:
+    it has dropped out, commands do not reach it, or its report is wrong. A robot that reports no
+    torque at any joint is not checked.
+
+    Both torques pass the same low-pass filter with the time constant TORQUE_WINDOW_S.
+    """
+
+    is_immediate = False
+
+    def __init__(self) -> None:
+        self._expected, self._reported = np.zeros(12), np.zeros(12)
+
+    @override
+    def check(self, data: GuardInput) -> str | None:
+        if data.mode not in MOVING_MODES or not data.state.tau.any():
+            self._expected[:] = self._reported[:] = 0.0
+            return None
+        share = -math.expm1(-max(data.gap, 0.0) / TORQUE_WINDOW_S)
+        self._expected += share * (ideal_torque(data.command, data.state) - self._expected)
+        self._reported += share * (data.state.tau - self._reported)
+        error = np.abs(self._reported - self._expected)
+        i = int(np.argmax(error))
+        if not error[i] > data.config.max_torque_error:
+            return None
+        return f"{JOINT_NAMES[i]} gives {self._reported[i]:+.0f} N m, commanded {self._expected[i]:+.0f} N m"
+
+
+class JointStuck(Guard):
+    """A joint has pushed with more than `stuck_torque` of its drive's largest torque for
+    `stuck_time` and did not move.
+    """
+
+    is_immediate = False
+
+    def __init__(self) -> None:
+        self._time, self._stuck_at = np.zeros(12), np.zeros(12)
+
+    @override
+    def check(self, data: GuardInput) -> str | None:
+        q = data.state.q
+        pushes = np.abs(data.state.tau) > data.config.stuck_torque * TORQUE_LIMIT
+        stays = pushes & (np.abs(q - self._stuck_at) < STUCK_RANGE_RAD)
+        self._time = np.where(stays, self._time + max(data.gap, 0.0), 0.0)
+        self._stuck_at = np.where(stays, self._stuck_at, q)
+        for i in np.flatnonzero(self._time > data.config.stuck_time):
+            return f"{JOINT_NAMES[i]} is stuck at {q[i]:.2f} rad: it pushes with {data.state.tau[i]:+.0f} N m"
+        return None
+
+
+class MotorDroppedOut(Guard):
+    """The board has switched off a motor."""
+
+    @override
+    def check(self, data: GuardInput) -> str | None:
+        if data.motors is None or not data.motors.dropped_out.any():
+            return None
+        return f"{JOINT_NAMES[int(np.argmax(data.motors.dropped_out))]} was switched off by the board"
+
+
+class MotorHot(Guard):
+    """A motor is hotter than `max_temperature`."""
+
+    level = Level.STANCE
+
+    @override
+    def check(self, data: GuardInput) -> str | None:
+        if data.motors is None:
+            return None
+        i, limit = int(np.argmax(data.motors.temperature)), data.config.max_temperature
+        if data.motors.temperature[i] <= limit:
+            return None
+        return f"{JOINT_NAMES[i]} is at {data.motors.temperature[i]:.0f} deg C, limit {limit:.0f}: let it cool down"
+
+
+class FootForceFrozen(Guard):
+    """The force of a foot does not change for `frozen_foot_time` while the robot walks. The
+    controller does not use it.
+    """
+
+    is_immediate = False
+    level = Level.NOTICE
+    modes = WALK_MODES
+
+    def __init__(self) -> None:
+        self._time = np.zeros(4)
+
+    @override
+    def check(self, data: GuardInput) -> str | None:
+        if data.previous is None or not data.is_moving or data.mode != "walk":
+            self._time[:] = 0.0
+            return None
+        is_same = data.state.foot_force == data.previous.foot_force
+        self._time = np.where(is_same, self._time + data.gap, 0.0)
+        for i in np.flatnonzero(self._time > data.config.frozen_foot_time):
+            return f"the force of foot {LEGS[i]} has stayed at {data.state.foot_force[i]:.0f} N for {self._time[i]:.1f} s"
+        return None
+
+
+def ideal_torque(command: JointCommand, state: RobotState) -> Array:
+    """Compute the torque that an ideal drive gives for a command at the present joint state.
+
+        tau = clip(kp (q_des - q) + kd (dq_des - dq) + tau_ff, -TORQUE_LIMIT, TORQUE_LIMIT)
+
+    Args:
+        command: The joint command.
+        state: Present angles and speeds.
+
+    Returns:
+        Torques, (12,), N m.
+    """
+    requested = command.torque(state.q, state.dq)
+    torque: Array = np.minimum(np.maximum(requested, -TORQUE_LIMIT), TORQUE_LIMIT)
+    return torque

@@ -1,0 +1,130 @@
+"""Guards of the trunk: its tilt, and the IMU. No ROS."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from typing_extensions import override
+
+from quadvel_description.arrays import Array
+from quadvel_description.kinematics import rotate
+from quadvel_description.robot import GRAVITY
+
+from ..guard import MOVING_MODES, Guard, GuardInput, Level
+from .legs import NOTABLE_MOTION_RAD
+
+GYRO_WINDOW_S = 0.2  # window in which orientation and angular velocity must agree
+ACCELERATION_WINDOW_S = 0.5  # window of the mean acceleration, which is small for a legged robot
+
+
+class Tilted(Guard):
+    """The trunk is tilted by more than `max_tilt`: the robot has fallen or is about to."""
+
+    @override
+    def check(self, data: GuardInput) -> str | None:
+        _, x, y, _ = data.state.quaternion.tolist()
+        tilt = math.acos(max(-1.0, min(1.0 - 2.0 * (x * x + y * y), 1.0)))
+        limit = data.config.max_tilt
+        return f"the trunk is tilted by {tilt:.2f} rad, limit {limit:.2f}" if tilt > limit else None
+
+
+class ImuInconsistent(Guard):
+    """The orientation deviates from the integrated gyroscope by more than `max_attitude_error`.
+
+    e' = e exp(-dt / GYRO_WINDOW_S) + log(R^T R') - dt (w' + w) / 2
+    """
+
+    is_immediate = False
+
+    def __init__(self) -> None:
+        self._error = np.zeros(3)
+
+    @override
+    def check(self, data: GuardInput) -> str | None:
+        if (
+            data.mode not in MOVING_MODES
+            or data.previous is None
+            or not 0.0 < data.gap <= 0.01
+            or not data.is_sound
+        ):
+            self._error[:] = 0.0
+            return None
+        turned = _rotation_between(data.previous.quaternion, data.state.quaternion)
+        gyro = 0.5 * data.gap * (data.state.angular_velocity + data.previous.angular_velocity)
+        self._error = self._error * math.exp(-data.gap / GYRO_WINDOW_S) + turned - gyro
+        error, limit = math.hypot(*self._error.tolist()), data.config.max_attitude_error
+        if error <= limit:
+            return None
+        return f"the orientation is {error:.2f} rad off the integrated gyroscope, limit {limit:.2f}"
+
+
+class ImuFrozen(Guard):
+    """Orientation and angular velocity, which is not zero, do not change a bit for `frozen_time`,
+    while the joints move.
+    """
+
+    is_immediate = False
+    level = Level.STANCE
+
+    def __init__(self) -> None:
+        self._time = self._joint_travel = 0.0
+
+    @override
+    def check(self, data: GuardInput) -> str | None:
+        if data.previous is None:
+            return None
+        gyro = data.state.angular_velocity
+        is_same = (
+            np.array_equal(gyro, data.previous.angular_velocity)
+            and np.array_equal(data.state.quaternion, data.previous.quaternion)
+            and gyro.any()
+        )
+        self._time = self._time + data.gap if is_same else 0.0
+        self._joint_travel = (
+            self._joint_travel + float(np.abs(data.state.q - data.previous.q).max()) if is_same else 0.0
+        )
+        if self._time <= data.config.frozen_time or self._joint_travel <= NOTABLE_MOTION_RAD:
+            return None
+        return f"the IMU has not changed for {1e3 * self._time:.0f} ms while the joints moved"
+
+
+class AccelerometerImplausible(Guard):
+    """The acceleration is more than `max_acceleration_error` on the mean of half a second: no robot
+    on legs does that. An accelerometer that shows only zeros is not checked.
+
+        a_mean' = a_mean + (1 - exp(-dt / ACCELERATION_WINDOW_S)) (R a - g - a_mean)
+    """
+
+    is_immediate = False
+    level = Level.STANCE
+
+    def __init__(self) -> None:
+        self._mean = np.zeros(3)
+
+    @override
+    def check(self, data: GuardInput) -> str | None:
+        if not np.isfinite(data.state.linear_acceleration).all():
+            return "the state's linear_acceleration is not finite"
+        if not data.state.linear_acceleration.any():
+            return None
+        now = rotate(data.state.quaternion, data.state.linear_acceleration)
+        now[2] -= GRAVITY
+        self._mean += (now - self._mean) * -math.expm1(-max(data.gap, 0.0) / ACCELERATION_WINDOW_S)
+        mean, limit = math.hypot(*self._mean.tolist()), data.config.max_acceleration_error
+        if mean <= limit:
+            return None
+        return f"the accelerometer shows {mean:.1f} m/s^2 on the mean of half a second, limit {limit:.1f}"
+
+
+def _rotation_between(before: Array, after: Array) -> Array:
+    """Return the rotation vector of a small rotation between two orientations, (3,), rad, body frame.
+
+    Twice the vector part of conj(before) * after; the sign selects the shorter rotation.
+    """
+    w, x, y, z = before.tolist()
+    a, b, c, d = after.tolist()
+    sign = 2.0 if w * a + x * b + y * c + z * d >= 0.0 else -2.0
+    return sign * np.array(
+        [w * b - x * a - y * d + z * c, w * c + x * d - y * a - z * b, w * d - x * c + y * b - z * a]
+    )
