@@ -44,7 +44,7 @@ SWITCHES: dict[str, dict[str, Any]] = {
     "cost of memory": {"memory_cost": 0.0},
     "grid of a screening": {"screening_grid": False},
     "kurtosis": {"kurtosis_test": False},
-    "clusters in motion": {"cluster_motion": 0.0},
+    "clusters in motion": {"cluster_motion_rad": 0.0},
     "averaged encoders": {"averaged_encoders": False},
     "even clocks": {"even_clocks": False},
     "sharp accelerations": {"sharp_accelerations": False},

@@ -13,7 +13,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "sysid.md"
 
 
 def _rows() -> list[list[str]]:
-    modules, _, _ = PAGE.read_text().partition("## One log")
+    modules, _, _ = PAGE.read_text().partition("## Records")
     cells = re.findall(r"^\| (`[^|]+) \|", modules, re.MULTILINE)
     return [[name.removesuffix(".py") for name in re.findall(r"`([^`]+)`", cell)] for cell in cells]
 
@@ -45,6 +45,18 @@ def test_imports_go_downwards_in_the_list_of_modules() -> None:
     for path in paths:
         above = {name for name in _imported(path) if place[name] < place[_name(path)]}
         assert not above, f"{path.name} imports {above}, which stand above it in {PAGE.name}"
+
+
+def test_parameters_that_hold_a_log_have_the_name_of_its_record() -> None:
+    table = re.findall(r"^\| `(\w+)` \| (.+?) \| `", PAGE.read_text(), re.MULTILINE)
+    names = {record: set(re.findall(r"`(\w+)`", cell)) for record, cell in table}
+    assert len(names) == 6
+    for path in PACKAGE.rglob("*.py"):
+        for one in ast.walk(ast.parse(path.read_text())):
+            if isinstance(one, ast.arg) and one.annotation is not None:
+                of = re.fullmatch(r"(?:Sequence\[)?(\w+)\]?(?: \| None)?", ast.unparse(one.annotation))
+                if of and of[1] in names:
+                    assert one.arg in names[of[1]], f"{path.name}:{one.lineno}: {one.arg}: {of[1]}"
 
 
 def test_the_tuned_constants_have_the_documented_values() -> None:

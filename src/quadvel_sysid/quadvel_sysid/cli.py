@@ -177,8 +177,8 @@ def identify(
 
 
 def _identify(
-    train: Sequence[Path],
-    heldout: Sequence[Path],
+    train_paths: Sequence[Path],
+    heldout_paths: Sequence[Path],
     read: Callable[[Path], Log],
     options: IdentifyOptions,
     cores: int | None,
@@ -194,8 +194,8 @@ def _identify(
 
         def prepare() -> tuple[Dataset, bool]:
             """Read and check the logs; release long ones, and return whether they are long."""
-            logs, kept = ([read(path) for path in paths] for paths in (train, heldout))
-            checked = check_logs(logs, kept, options.gains, lambda one: print_findings(one, messages))
+            train, heldout = ([read(path) for path in paths] for paths in (train_paths, heldout_paths))
+            checked = check_logs(train, heldout, options.gains, lambda one: print_findings(one, messages))
             long = sum(one.log.q.size for part in checked for one in part) >= _LONG_LOG_VALUES
             # Imported here, so that errors in the files appear before the engine is loaded.
             from .data.dataset import Dataset

@@ -8,22 +8,23 @@ The steps, each of which takes what the one before returns:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import attrs
 import numpy as np
 
 from quadvel_actuator.parameters import ActuatorParameters
-from quadvel_description.arrays import Bools, Indices
+from quadvel_description.arrays import Bools
 
 from .data.dataset import Dataset, Progress, no_progress
 from .data.noise import noise_variance
 from .data.plain_model import DRIVE_WINDOWS_S
 from .data.preparation import MIN_BLOCK_S, Preprocessed, preprocess
-from .data.signals import Samples
 from .data.split import DataSplit
-from .export.replay import Replay, find_load
+from .export.replay import Load, Replay, find_load
 from .logs.check_log import check_logs
+from .logs.findings import Finding
 from .logs.log import Log
 from .model.delays import longest_equivalent_delay, quantised_delays
 from .model.fit import fit
@@ -102,24 +103,12 @@ def identify_dataset(
     base = options.base or ActuatorParameters.default()
     load = find_load(dataset, options.robot)
     progress(0.02, "gains and delays")
-    windows = DRIVE_WINDOWS_S if dataset.body is None else (dataset.logs[0].period,)
-    shortest = MIN_BLOCK_S
-    if load is not None and not dataset.heldout:
-        shortest = max(MIN_BLOCK_S, _BLOCK_STRETCHES * load.stretch_s)
-    prepared, notes = preprocess(dataset, windows, shortest, options.search)
-    samples, parts = prepared.samples, prepared.parts
-    step_numbers = iter(range(10**6))
-
-    def report_step(text: str) -> None:
-        progress(min(0.1 + 0.04 * next(step_numbers), 0.85), text)
+    prepared, notes = _preprocess(dataset, load, options.search)
+    parts = prepared.parts
 
     # 2. Search for effects on a subset of the rows.
-    plain = _plain_model(prepared)
-    noise = noise_variance(samples, parts.fit_or_select, plain.residual())
-    part, rows = _search_rows(prepared)
-    evaluator = ModelEvaluator(parts.select_rows(rows), noise, options.cores, options.search)
-    plain = attrs.evolve(plain, samples=part)
-    search, before = Search(evaluator, report_step), evaluator.fit(plain)
+    evaluator, plain = _evaluator(prepared, options)
+    search, before = Search(evaluator, _step_counter(progress)), evaluator.fit(plain)
     searched = search.best(plain)
     best, best_effects = searched.best, searched.best_effects
 
@@ -142,14 +131,12 @@ def identify_dataset(
         after=after,
         evidence=_evidence(search, searched.record, chosen, after.model, parts),
         half_widths=intervals(after.all_rows, attrs.evolve(parts, report=parts.report & final_rows)),
-        noise=noise,
+        noise=evaluator.noise,
         parts=parts,
         base=base,
     )
     found = build_identification(outcome, [*dataset.findings, *notes])
-    report = {**found.report, "baselines": baseline_errors(samples.logs, parts.fit_or_select, parts.report)}
-    if replay:
-        report |= replay.section(outcome.before.model, outcome.after.model)
+    report = {**found.report, **_comparisons(outcome, replay)}
     if "motion" in report:
         report |= motion_summary(report)
     report["warnings"] = [*report["warnings"], *contradictions(report)]
@@ -157,20 +144,35 @@ def identify_dataset(
     return attrs.evolve(found, report=report)
 
 
-def _plain_model(prepared: Preprocessed) -> Model:
-    """The EAM as a model that effects can be added to."""
+def _preprocess(
+    dataset: Dataset, load: Load | None, options: SearchOptions
+) -> tuple[Preprocessed, list[tuple[str, Finding]]]:
+    """Samples, data split and plain EAM, and notes on what was corrected."""
+    windows = DRIVE_WINDOWS_S if dataset.body is None else (dataset.logs[0].period,)
+    shortest = MIN_BLOCK_S
+    if load is not None and not dataset.heldout:
+        shortest = max(MIN_BLOCK_S, _BLOCK_STRETCHES * load.stretch_s)
+    return preprocess(dataset, windows, shortest, options)
+
+
+def _evaluator(prepared: Preprocessed, options: IdentifyOptions) -> tuple[ModelEvaluator, Model]:
+    """The data of the search, and the EAM on them as a model that effects can be added to."""
     eam, one = prepared.eam, np.zeros(len(prepared.samples.joints), dtype=np.intp)
     delays = np.stack([eam.input_delay, eam.output_delay])
-    return Model(prepared.samples, eam.window, eam.gains, one, delays, one)
-
-
-def _search_rows(prepared: Preprocessed) -> tuple[Samples, Indices]:
-    """The samples that the search uses, and their row numbers; without held-out logs."""
+    plain = Model(prepared.samples, eam.window, eam.gains, one, delays, one)
+    noise = noise_variance(prepared.samples, prepared.parts.fit_or_select, plain.residual())
+    # The search uses fewer rows, and none of the held-out logs.
     samples = prepared.samples.drop_heldout(prepared.parts.fit_or_select)
     step = min(round(samples.tau.size / _SEARCH_VALUES), round(_MAX_SEARCH_STEP_S / samples.period))
-    if step > 1:
-        return samples.thinned(step)
-    return samples, np.arange(len(samples.t))
+    samples, rows = samples.thinned(max(step, 1))
+    evaluator = ModelEvaluator(prepared.parts.select_rows(rows), noise, options.cores, options.search)
+    return evaluator, attrs.evolve(plain, samples=samples)
+
+
+def _step_counter(progress: Progress) -> Callable[[str], None]:
+    """A callback for the steps of the search, whose number is not known in advance."""
+    numbers = iter(range(10**6))
+    return lambda text: progress(min(0.1 + 0.04 * next(numbers), 0.85), text)
 
 
 def _refit_all_rows(fitted: FittedModel, prepared: Preprocessed) -> Model:
@@ -207,6 +209,14 @@ def _evidence(
         is_white=fitted.is_white,
         correlates=() if fitted.is_white or has_regressors else search.residual_correlates(fitted),
     )
+
+
+def _comparisons(outcome: Outcome, replay: Replay | None) -> dict[str, Any]:
+    """Sections of the report: errors of the baselines, and of replays where there is a load."""
+    parts = outcome.parts
+    baselines = baseline_errors(outcome.samples, parts.fit_or_select, parts.report)
+    replays = replay.section(outcome.before.model, outcome.after.model) if replay else {}
+    return {"baselines": baselines, **replays}
 
 
 def _heldout_gain(model: Model, index: int, parts: DataSplit) -> tuple[float, float]:

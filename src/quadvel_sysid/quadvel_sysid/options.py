@@ -5,6 +5,7 @@ Each field states its description, unit and bounds in its metadata.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import attrs
@@ -13,27 +14,17 @@ from attrs import validators
 from quadvel_actuator.parameters import ActuatorParameters
 
 
-def _number(default: Any, description: str, unit: str, low: float, high: float) -> Any:
-    """A field for a number within bounds."""
-    return attrs.field(
-        default=default,
-        validator=[validators.ge(low), validators.le(high)],
-        metadata={"description": description, "unit": unit, "bounds": (low, high)},
-    )
-
-
-def _choice(default: Any, description: str, unit: str = "", bounds: tuple[Any, ...] = ()) -> Any:
-    """A field for anything but a bounded number; `bounds` are documented and checked where it is used."""
-    return attrs.field(default=default, metadata={"description": description, "unit": unit, "bounds": bounds})
+def _option(default: Any, description: str, bounds: tuple[float, float] | None = None, unit: str = "") -> Any:
+    """A field; numbers are checked against the bounds here, pairs of numbers where they are used."""
+    is_number = isinstance(default, (int, float))
+    validator = [validators.ge(bounds[0]), validators.le(bounds[1])] if bounds and is_number else None
+    metadata = {"description": description, "unit": unit, "bounds": bounds}
+    return attrs.field(default=default, validator=validator, metadata=metadata)
 
 
 def _switch(description: str) -> Any:
     """A field for what is on unless an ablation switches it off."""
-    return attrs.field(
-        default=True,
-        validator=validators.instance_of(bool),
-        metadata={"description": description, "unit": "", "bounds": (False, True)},
-    )
+    return _option(True, description, (False, True))
 
 
 @attrs.frozen
@@ -46,24 +37,20 @@ class SearchOptions:
     even_clocks: bool = _switch("restore the even clock of jittering stamps")
     averaged_encoders: bool = _switch("average encoder noise that the drive did not act on")
     sharp_accelerations: bool = _switch("keep accelerations sharp where a command arrives")
-    instants_per_row: int = _number(
-        2, "instants of a row for effects that are integrated between the rows", "", 1, 8
-    )
-    cluster_motion: float = _number(0.02, "motion of some joint that ends a cluster", "rad", 0.0, 1.0)
+    instants_per_row: int = _option(2, "instants of a row, for effects that act between rows", (1, 8))
+    cluster_motion_rad: float = _option(0.02, "motion of some joint that ends a cluster", (0.0, 1.0), "rad")
     kurtosis_test: bool = _switch("test the residual for kurtosis as well as for autocorrelation")
-    delay_starts: int = _number(3, "points of the grid of delays from which fits start", "", 1, 100)
+    delay_starts: int = _option(3, "points of the grid of delays from which fits start", (1, 100))
     far_delays: bool = _switch("try delays up to 8 ms from the present ones")
     longest_delays: bool = _switch("choose the longest equivalent delays, and whole drive steps")
     screening_grid: bool = _switch("screen candidates on a grid of delays")
-    memory_cost: float = _number(
-        0.5, "further parameters that an effect with memory, or one like a delay, counts as", "", 0.0, 10.0
+    memory_cost: float = _option(
+        0.5, "further parameters of an effect with memory or one like a delay", (0.0, 10.0)
     )
-    lost_commands_at_random: bool = _switch(
-        "accept lost commands only if the command's age does not predict them"
-    )
-    fitted_effects: int = _number(6, "effects that are fitted after a screening", "", 1, 100)
-    fitted_regressors: int = _number(4, "regressors that are fitted after a screening", "", 1, 100)
-    shared_trials: int = _number(3, "best candidates for which sharing across joints is tested", "", 0, 100)
+    lost_commands_at_random: bool = _switch("accept lost commands only if they are lost at random")
+    fitted_effects: int = _option(6, "effects that are fitted after a screening", (1, 100))
+    fitted_regressors: int = _option(4, "regressors that are fitted after a screening", (1, 100))
+    shared_trials: int = _option(3, "best candidates for which sharing across joints is tested", (0, 100))
     second_starts: bool = _switch("fit effects that shift the torque from two starts")
     regressors_at_nearby_delays: bool = _switch("refit regressors from nearby delays")
     finer_regressors: bool = _switch("refine the shapes of regressors after their screening")
@@ -84,30 +71,19 @@ SEARCH_DEFAULTS = SearchOptions()
 class IdentifyOptions:
     """What a user chooses about an identification."""
 
-    gains: tuple[float, float] | None = _choice(
+    gains: tuple[float, float] | None = _option(
         None,
         "commanded kp and kd of logs that hold none; None to fit them",
+        (0.0, math.inf),
         "N m/rad, N m s/rad",
-        (0.0, float("inf")),
     )
-    max_values: int = _number(
-        60_000,
-        "torque values to use over all logs and joints; longer logs are cut into excerpts",
-        "",
-        1000,
-        10**9,
+    max_values: int = _option(60_000, "torque values of all logs; longer logs are cut", (1000, 10**9))
+    base: ActuatorParameters | None = _option(
+        None, "model whose torque limits are kept; None for the default"
     )
-    base: ActuatorParameters | None = _choice(
-        None, "parameters whose torque limits the corrected model keeps; None for the defaults"
-    )
-    robot: str | None = _choice(
-        None,
-        "robot whose legs replay the commands: aliengo, go2, or an MJCF or URDF file; None for no replay",
-    )
-    cores: int = _number(1, "worker processes; the report does not depend on them", "", 1, 1024)
-    search: SearchOptions = _choice(
-        SEARCH_DEFAULTS, "what the search tries; an ablation switches some of it off"
-    )
+    robot: str | None = _option(None, "legs that replay the commands: aliengo, go2, an MJCF or URDF file")
+    cores: int = _option(1, "worker processes; the report does not depend on them", (1, 1024))
+    search: SearchOptions = _option(SEARCH_DEFAULTS, "what the search tries; an ablation switches some off")
 
 
 DEFAULTS = IdentifyOptions()

@@ -76,14 +76,11 @@ class Dataset:
             progress(0.01, "the torque that the motion implies")
             logs[0], body = imply_torque(logs[0])
             logs[1:] = [imply_torque(log, body)[0] for log in logs[1:]]
-        rows = max_values // (len(logs) * len(logs[0].joints))
+        count, rows = len(train), max_values // (len(logs) * len(logs[0].joints))
         # One script may have generated all logs. Excerpts of held-out logs therefore lie between
         # those of the fitted logs in time.
-        excerpts = [
-            cut_excerpts(log, rows * log.period, between=k >= len(train)) for k, log in enumerate(logs)
-        ]
-        fitted, reported = excerpts[: len(train)], excerpts[len(train) :]
+        excerpts = [cut_excerpts(log, rows * log.period, between=k >= count) for k, log in enumerate(logs)]
         findings = tuple(
             (checked.log.name, one) for checked in (*train, *heldout) for one in checked.findings
         )
-        return cls(tuple(chain(*fitted)), tuple(chain(*reported)), findings, body)
+        return cls(tuple(chain(*excerpts[:count])), tuple(chain(*excerpts[count:])), findings, body)

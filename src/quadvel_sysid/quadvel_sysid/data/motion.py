@@ -249,15 +249,13 @@ def average_over_steps(log: Log) -> tuple[Log, Array]:
     whole = np.array([log.valid[a : b + 1].all(axis=0) for a, b in zip(first, last, strict=True)])
     whole &= dt < 1.5 * count * log.period
     half = 0.5 * count * log.period
-    voltage = None if log.voltage is None else log.voltage[first]
-    temperature = None if log.temperature is None else log.temperature[first]
     coarse = attrs.evolve(
         log,
         t=0.5 * (log.t[first] + log.t[last]),
         t_cmd=log.t_cmd + half,
         valid=whole,
-        temperature=temperature,
-        voltage=voltage,
+        temperature=None if log.temperature is None else log.temperature[first],
+        voltage=None if log.voltage is None else log.voltage[first],
         tau=None,
         q=_trapezoid_mean(q, first, count),
         dq=_trapezoid_mean(dq, first, count),

@@ -310,6 +310,15 @@ class Samples:
         """Names of the joints."""
         return self.sources.series[0].log.joints
 
+    @property
+    def reference_gains(self) -> tuple[float, float]:
+        """Gains that deviations are relative to: medians of kp (N m/rad) and kd (N m s/rad)."""
+        kp, kd = (
+            float(np.median(np.concatenate([one.gains[name].ravel() for one in self.sources.series])))
+            for name in ("kp", "kd")
+        )
+        return max(kp, 1e-6), max(kd, 1e-6)
+
     def drop_heldout(self, rows: Bools) -> Samples:
         """Drop the logs at the end that hold none of the given rows.
 
@@ -332,8 +341,10 @@ class Samples:
             step: Spacing, rows.
 
         Returns:
-            The samples, and the indices of their rows.
+            The samples, and the indices of their rows; these samples if all rows are kept.
         """
+        if step == 1:
+            return self, np.arange(len(self.t))
         rows = np.arange(step - 1, len(self.t), step)
         t, period = self.t[rows], step * self.period
         start = np.diff(np.cumsum(self.start)[rows], prepend=-1) > 0

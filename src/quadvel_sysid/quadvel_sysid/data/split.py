@@ -73,7 +73,7 @@ class DataSplit:
         return total
 
 
-def cluster_starts(samples: Samples, motion: float = SEARCH_DEFAULTS.cluster_motion) -> Indices:
+def cluster_starts(samples: Samples, motion: float = SEARCH_DEFAULTS.cluster_motion_rad) -> Indices:
     """Divide the rows into clusters for the tests.
 
     A cluster begins where a log begins, or when at least `CLUSTER_DURATION_S` has passed and some

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, TypeVar
+from collections.abc import Mapping
+from typing import Any, TypeVar
 
 import attrs
 import numpy as np
@@ -12,8 +12,9 @@ from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description.arrays import Bools
 
 from ..data.dataset import Dataset
+from ..data.motion import Body
 from ..data.preparation import Preprocessed
-from ..logs.log import Log, LogError
+from ..logs.log import LogError
 from ..model.torque_model import Model
 from .export_parameters import actuator_parameters
 from .legs import Legs
@@ -23,37 +24,8 @@ _ERROR_RATIO = 0.9
 Key = TypeVar("Key")
 
 
-class Load(Protocol):
-    """What the joints move: `data.motion.Body`, fitted to the motion, or `Legs` of a description."""
-
-    @property
-    def stretch_s(self) -> float:
-        """Duration of a replay from one measured state, s."""
-
-    def replay_errors(
-        self, logs: Sequence[Log], parameters: ActuatorParameters, rows: Bools
-    ) -> Mapping[str, Any]:
-        """Replay the commands of logs and compute the root mean square deviations.
-
-        Args:
-            logs: The logs, one after the other.
-            parameters: The actuator model.
-            rows: (N, J) rows of all logs that count.
-
-        Returns:
-            Deviations, among them `q_rms_rad` and `dq_rms_rad_s`.
-        """
-
-    def report_section(self, before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-        """Build the section of report.json on the replay.
-
-        Args:
-            before: Replay errors of the plain EAM.
-            after: Replay errors of the corrected model.
-
-        Returns:
-            The section by its name.
-        """
+Load = Body | Legs
+"""What the joints move: a body fitted to the motion, or the legs of a robot's description."""
 
 
 def find_load(dataset: Dataset, robot: str | None) -> Load | None:
@@ -71,14 +43,12 @@ def find_load(dataset: Dataset, robot: str | None) -> Load | None:
     """
     if robot is None:
         return dataset.body
+    gains = "the commanded gains (or --gains KP KD)"
     for log in dataset.logs:
-        known = {"tau": dataset.body is None, "kp": log.kp is not None, "kd": log.kd is not None}
-        for name, there in known.items():
-            if not there:
-                what = "the torque" if name == "tau" else "the commanded gains (or --gains KP KD)"
-                raise LogError(
-                    f"{log.name}: {name}: not in the log, expected {what} to replay the commands (--robot)"
-                )
+        for name, what in (("tau", "the torque"), ("kp", gains), ("kd", gains)):
+            if getattr(log, name) is None or (name == "tau" and dataset.body is not None):
+                text = f"not in the log, expected {what} to replay the commands (--robot)"
+                raise LogError(f"{log.name}: {name}: {text}")
     return Legs.load(robot, dataset.logs[0].joints)
 
 

@@ -91,7 +91,7 @@ def check_logs(
     """
 
     def passed(log: Log) -> CheckedLog:
-        checked = check_log(_with_joints_of(log, train[0]), gains)
+        checked = check_log(_with_joints_of_first(log, train), gains)
         on_checked(checked)
         checked.raise_refusal()
         return checked
@@ -99,8 +99,9 @@ def check_logs(
     return [passed(log) for log in train], [passed(log) for log in heldout]
 
 
-def _with_joints_of(log: Log, first: Log) -> Log:
+def _with_joints_of_first(log: Log, logs: Sequence[Log]) -> Log:
     """The log with the joints of the first; raises LogError unless both or none hold torque."""
+    first = logs[0]
     if (log.tau is None) != (first.tau is None):
         lacking, other = (log, first) if log.tau is None else (first, log)
         raise LogError(f"{lacking.name}: tau: the field is missing, expected it as in {other.name}")

@@ -137,6 +137,17 @@ class Log:
         """
         return np.maximum(np.searchsorted(self.t_cmd, np.asarray(at) + TIME_TOLERANCE_S, side="right") - 1, 0)
 
+    def joints_where(self, hit: Bools) -> tuple[str, ...]:
+        """Return the names of the joints that a mask marks.
+
+        Args:
+            hit: (J,) mask.
+
+        Returns:
+            The names, in the order of the log.
+        """
+        return tuple(name for name, one in zip(self.joints, hit, strict=True) if one)
+
     def without_feed_forward(self) -> Log:
         """Subtract the feed-forward torque from the measured torque.
 

@@ -14,7 +14,6 @@ from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description.arrays import Array
 
 from ..data.plain_model import pd_torque
-from ..data.preparation import reference_gains
 from ..data.signals import Samples
 from ..data.split import DataSplit
 from ..export.export_parameters import (
@@ -52,14 +51,7 @@ _TORQUE_LIMIT_MARGIN = 1.1
 
 _MAX_POINTS = 4000
 """Maximum number of points of a series in a figure."""
-_SIGNAL_UNITS = {
-    "q": "rad",
-    "q_des": "rad",
-    "dq": "rad/s",
-    "ddq": "rad/s^2",
-    "tau": "N m",
-    "t": "s",
-}
+_SIGNAL_UNITS = {"q": "rad", "q_des": "rad", "dq": "rad/s", "ddq": "rad/s^2", "tau": "N m", "t": "s"}
 
 
 @attrs.frozen(eq=False)
@@ -308,7 +300,7 @@ def _gain_entries(o: Outcome) -> dict[str, Any]:
     """Gain deviations and delays with intervals: a number if joints share it, else a list."""
     model, widths = o.after.all_rows, o.half_widths
     found: dict[str, Any] = {}
-    halves = widths.gains * np.array(reference_gains(model.samples))[:, None]
+    halves = widths.gains * np.array(model.samples.reference_gains)[:, None]
     rows = {
         **dict(zip(_DELTAS, zip(gain_deviations(model), halves, strict=True), strict=True)),
         "input_delay_ms": (1e3 * model.delays[0], 1e3 * widths.delays[0]),

@@ -39,6 +39,7 @@ def report_page(identification: Identification) -> str:
     """
     report, traces = identification.report, identification.traces
     candidates = sorted(_candidates(report), key=lambda one: -one["gain"])
+    bars = [[one[key] for one in candidates] for key in ("name", "gain", "selected")]
     return render(
         "report.html.j2",
         title="Identification of the actuators",
@@ -51,7 +52,7 @@ def report_page(identification: Identification) -> str:
         replayed=_replayed(report),
         shapes=_shape_figures(identification.shapes),
         candidates=candidates,
-        candidate_figure=_candidate_figure(candidates) if candidates else None,
+        candidate_figure=figures.candidate_figure(*bars) if candidates else None,
         parameters=[(name, rows) for name, rows in _parameters(report) if rows],
         learned=next((one for one in report["effects"] if one["name"] == LEARNED_RESIDUAL), None),
         uncorrelated=UNCORRELATED_TEXT,
@@ -141,27 +142,9 @@ def _candidates(report: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     """Selected and rejected candidates."""
     for one in report["effects"]:
         reason = _placement_text(one, report["joints"])
-        yield {
-            "name": one["name"],
-            "gain": one["heldout_gain"],
-            "p_value": one["p_value"],
-            "reason": reason,
-            "selected": True,
-        }
+        yield {**one, "gain": one["heldout_gain"], "reason": reason, "selected": True}
     for one in report["rejected"]:
-        yield {
-            "name": one["name"],
-            "gain": one["selecting_gain"],
-            "p_value": None,
-            "reason": one["reason"],
-            "selected": False,
-        }
-
-
-def _candidate_figure(candidates: Sequence[Mapping[str, Any]]) -> str:
-    """Figure of the gains of the candidates."""
-    names, gains, selected = ([one[key] for one in candidates] for key in ("name", "gain", "selected"))
-    return figures.candidate_figure(names, gains, selected)
+        yield {**one, "gain": one["selecting_gain"], "p_value": None, "selected": False}
 
 
 def _placement_text(effect: Mapping[str, Any], joints: Sequence[str]) -> str:

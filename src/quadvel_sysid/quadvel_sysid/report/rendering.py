@@ -35,20 +35,12 @@ def short_joint_name(joint: str) -> str:
     return joint.removesuffix("_joint")
 
 
-def _environment() -> Environment:
-    """The templates, with the filters for numbers, joints and files."""
-    found = Environment(
-        loader=PackageLoader("quadvel_sysid.report"), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
-    found.filters |= {
-        "number": number_text,
-        "short": short_joint_name,
-        "file": lambda path: PurePath(path).name,
-    }
-    return found
-
-
-_ENVIRONMENT = _environment()
+_ENVIRONMENT = Environment(
+    loader=PackageLoader("quadvel_sysid.report"), autoescape=True, trim_blocks=True, lstrip_blocks=True
+)
+_ENVIRONMENT.filters["number"] = number_text
+_ENVIRONMENT.filters["short"] = short_joint_name
+_ENVIRONMENT.filters["file"] = lambda path: PurePath(path).name
 
 
 def render(template: str, **values: Any) -> str:

@@ -21,7 +21,6 @@ from .channels import (
     MOVING_SPAN_RAD,
     MOVING_SPEED_RAD_S,
     TURN_RAD,
-    joints_where,
     sample_rows,
     slope_at_rows,
 )
@@ -77,9 +76,9 @@ def wrapped_angles(log: Log) -> Iterator[Finding | Log]:
         # The unwrapped angles may differ from the commands by full turns; remove these.
         off = np.median(q_des[log.command_rows(log.t)] - q, axis=0)
         q = np.where(hit, q + turn * np.round(off / turn), log.q)
-        listed = format_names(joints_where(log, hit))
+        listed = format_names(log.joints_where(hit))
         text = f"q: jumps by {unit} in one row, {int(jumps.sum())} times on {listed}; unwrapped"
-        yield Finding("warning", "q", joints_where(log, hit), text)
+        yield Finding("warning", "q", log.joints_where(hit), text)
         # Speed of the jumps that were removed, in the rows where they happen.
         leap = (
             np.diff(q - log.q, axis=0, prepend=0.0 * q[:1])
@@ -127,12 +126,12 @@ def unusable_speed(log: Log) -> Iterator[Finding | Log]:
             if "dq" not in log.derived and _explained_share(mended) < _explained_share(log):
                 text += ": but the drive acted on it, so it stays as logged"
                 yield Finding(
-                    "note", "dq", joints_where(log, hit), text.format(format_names(joints_where(log, hit)))
+                    "note", "dq", log.joints_where(hit), text.format(format_names(log.joints_where(hit)))
                 )
             else:
                 text += f" by cubics over {1e3 * made.window_s:.3g} ms"
                 yield Finding(
-                    kind, "dq", joints_where(log, hit), text.format(format_names(joints_where(log, hit)))
+                    kind, "dq", log.joints_where(hit), text.format(format_names(log.joints_where(hit)))
                 )
                 yield mended
             return
@@ -205,8 +204,8 @@ def speed_units(log: Log) -> Iterator[Finding]:
                 ),
                 "expected q in rad, dq in rad/s, t in s",
             )
-            description = text.format(joints=format_names(joints_where(log, hit)), number=number, unit=unit)
-            yield Finding(kind, "dq", joints_where(log, hit), f"dq: {description}")
+            description = text.format(joints=format_names(log.joints_where(hit)), number=number, unit=unit)
+            yield Finding(kind, "dq", log.joints_where(hit), f"dq: {description}")
             return
 
 
@@ -230,7 +229,7 @@ def angle_units(log: Log) -> Iterator[Finding]:
             yield Finding("refusal", field, (), text)
             return
     most = np.percentile(np.abs(q), 95, axis=0)
-    if (joints := joints_where(log, most > MAX_ANGLE_RAD)) and set(log.joints) <= set(JOINT_NAMES):
+    if (joints := log.joints_where(most > MAX_ANGLE_RAD)) and set(log.joints) <= set(JOINT_NAMES):
         text = f"q: up to {most.max():.0f} on {format_names(joints)}: degrees? expected rad"
         yield Finding("refusal", "q", joints, text)
     elif joints:

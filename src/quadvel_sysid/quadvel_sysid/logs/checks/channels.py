@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import attrs
 import numpy as np
 
-from quadvel_description.arrays import Bools, Floats, Indices
+from quadvel_description.arrays import Floats, Indices
 from quadvel_description.robot import JOINT_NAMES, LOWER, UPPER
 
 from ..findings import Finding, format_names
@@ -61,19 +61,6 @@ def slope_at_rows(log: Log, values: Floats, row: Indices) -> Floats:
     return np.asarray((values[last] - values[first]) / (log.t[last] - log.t[first])[:, None], dtype=float)
 
 
-def joints_where(log: Log, hit: Bools) -> tuple[str, ...]:
-    """Return the names of the joints that a mask marks.
-
-    Args:
-        log: The log.
-        hit: (J,) mask.
-
-    Returns:
-        The names, in the order of the log.
-    """
-    return tuple(name for name, one in zip(log.joints, hit, strict=True) if one)
-
-
 def motionless(log: Log) -> Iterator[Finding]:
     """Joints that never move.
 
@@ -83,7 +70,7 @@ def motionless(log: Log) -> Iterator[Finding]:
     Yields:
         A refusal if no joint moves, a warning if some joints do not.
     """
-    resting = joints_where(log, np.ptp(log.q, axis=0) < MOVING_SPAN_RAD)
+    resting = log.joints_where(np.ptp(log.q, axis=0) < MOVING_SPAN_RAD)
     if len(resting) == len(log.joints):
         yield Finding("refusal", "q", resting, "q: no joint ever moves, so nothing can be identified")
     elif resting:
@@ -102,7 +89,7 @@ def torque_presence(log: Log) -> Iterator[Finding | Log]:
     """
     tau = log.tau
     if tau is not None:
-        dead = joints_where(log, np.ptp(tau, axis=0) == 0.0)
+        dead = log.joints_where(np.ptp(tau, axis=0) == 0.0)
         if len(dead) == len(log.joints):
             text = f"tau: is {tau[0, 0]:g} throughout, which is no measurement; treated as not logged"
             yield Finding("warning", "tau", dead, text)

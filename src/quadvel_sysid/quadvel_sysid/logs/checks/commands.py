@@ -12,8 +12,8 @@ from quadvel_description.arrays import Array
 
 from ..findings import Finding, format_names
 from ..log import Log
-from .channels import MOVING_SPAN_RAD, joints_where, sample_rows
-from .response import motion_regressors
+from .channels import MOVING_SPAN_RAD, sample_rows
+from .response import least_squares_residual, motion_regressors
 
 MIN_SWING_RAD = 0.5
 """rad; span of q from which a resting command is checked; a drive may yield as far to a load."""
@@ -52,7 +52,7 @@ def constant_command(log: Log) -> Iterator[Finding | Log]:
     hit = np.array([bool(rests) and not _holds(log, j) for j, rests in enumerate(resting)])
     if not hit.any():
         return
-    joints = joints_where(log, hit)
+    joints = log.joints_where(hit)
     values = sorted({f"{value:.3g}" for value in np.median(log.q_des, axis=0)[hit]})
     where = "all joints" if hit.all() else format_names(joints)
     text = f"q_des: never changes ({format_names(values)} on {where}) though q moves, so nothing follows a position"
@@ -79,13 +79,8 @@ def _holds(log: Log, j: int) -> bool:
     if log.tau_ff is not None:
         torque = torque - log.tau_ff[log.command_rows(log.t[row]), j]
     moved = np.asarray(motion_regressors(log.dq[row, j]), dtype=np.float64)
-    rest, angle = (_residual(moved, np.asarray(x, dtype=float)) for x in (torque, log.q[row, j]))
+    rest, angle = (least_squares_residual(moved, np.asarray(x, dtype=float)) for x in (torque, log.q[row, j]))
     pull = float(rest @ angle)
     answered = pull**2 / ((rest @ rest) * (angle @ angle) + 1e-12)
     left = (1.0 - answered) * float(rest @ rest) / (len(row) * float(np.var(torque)) + 1e-12)
     return bool(pull < 0.0 and answered > MIN_ANSWERED_SHARE and left < MAX_HOLDING_ERROR)
-
-
-def _residual(signals: Array, x: Array) -> Array:
-    """Residual of `x` after a least-squares fit on `signals`."""
-    return np.asarray(x - signals @ np.linalg.lstsq(signals, x, rcond=1e-9)[0])

@@ -18,7 +18,7 @@ from quadvel_description.arrays import Bools, Floats, Indices
 
 from ..findings import Finding, format_names
 from ..log import Log
-from .channels import DEGREE_RAD, MOVING_SPAN_RAD, TURN_RAD, joints_where
+from .channels import DEGREE_RAD, MOVING_SPAN_RAD, TURN_RAD
 
 MAX_ROWS = 4000
 """Rows of a log that are used, spread over its length."""
@@ -163,6 +163,19 @@ def motion_regressors(dq: Floats) -> Floats:
     return np.stack([dq, np.tanh(dq / FRICTION_SPEED_RAD_S), np.ones(len(dq))], 1)
 
 
+def least_squares_residual(signals: Floats, x: Floats) -> Floats:
+    """Compute the residual of a least-squares fit.
+
+    Args:
+        signals: (R, K) regressors.
+        x: (R,) values.
+
+    Returns:
+        (R,) residual.
+    """
+    return np.asarray(x - signals @ np.linalg.lstsq(signals, x, rcond=1e-9)[0])
+
+
 def _project_out(regressors: Floats, x: Floats) -> Floats:
     """Residual of `x` (R,) or (R, L) after a least-squares fit on `regressors` (R, K)."""
     basis = np.linalg.qr(regressors)[0]
@@ -201,7 +214,7 @@ def opposite_signs(log: Log, found: Response) -> Iterator[Finding]:
     )
     for field, hit, text in cases:
         if (hit & strong).any():
-            joints = joints_where(log, hit & strong)
+            joints = log.joints_where(hit & strong)
             r = float(np.median(found.command_correlation[hit & strong]))
             correlation = f"partial correlation of torque and command {r:.2f}"
             description = f"{field}: {text.format(format_names(joints))} ({correlation})"
@@ -295,9 +308,7 @@ def unresponsive(log: Log, found: Response) -> Iterator[Finding]:
     if (lost | ~used).all():
         rests = np.ptp(log.q_des, axis=0) < MOVING_SPAN_RAD
         never = (
-            f"q_des never changes on {format_names(joints_where(log, rests))}, and tau "
-            if rests.any()
-            else ""
+            f"q_des never changes on {format_names(log.joints_where(rests))}, and tau " if rests.any() else ""
         )
         text = (
             f"tau: {never}does not answer the position error on any joint (which explains "
@@ -306,7 +317,7 @@ def unresponsive(log: Log, found: Response) -> Iterator[Finding]:
         )
         yield Finding("refusal", "tau", log.joints, text)
     elif (lost & moves & used).any():
-        joints = joints_where(log, lost & moves & used)
+        joints = log.joints_where(lost & moves & used)
         text = (
             f"tau: does not answer the position error on {format_names(joints)}: results for these joints "
             "are unreliable"
@@ -334,7 +345,7 @@ def gain_units(log: Log, found: Response) -> Iterator[Finding | Log]:
     off = clear & _is_far_off(ratio) & _is_far_off(found.command_gain / np.where(asked > 0.0, asked, 1.0))
     if not off.any():
         return
-    number, joints = float(np.median(ratio[off])), joints_where(log, off)
+    number, joints = float(np.median(ratio[off])), log.joints_where(off)
     known = [unit for unit, factor in _UNITS_OF_TORQUE if abs(np.log(number / factor)) < np.log(1.5)]
     if known or (off != clear).any():
         expected = f"{known[0]}? " if known else ""
@@ -389,7 +400,7 @@ def command_tracking(log: Log) -> Iterator[Finding]:
     opposite = least.diagonal()
     hit = (opposite < -EXPLAINED_ERROR_SHARE) & (most.diagonal() < 0.0)
     if hit.any():
-        joints = joints_where(log, hit)
+        joints = log.joints_where(hit)
         text = (
             f"q_des: {format_names(joints)} follows its own command with the opposite sign "
             f"(correlation {np.median(opposite[hit]):.2f})"

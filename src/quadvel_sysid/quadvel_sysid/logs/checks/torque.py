@@ -11,8 +11,8 @@ from quadvel_description.arrays import Bools, Floats, Indices
 
 from ..findings import Finding, format_names
 from ..log import Log
-from .channels import TURN_RAD, joints_where, sample_rows
-from .response import EXPLAINED_ERROR_SHARE, TIME_ROUNDING_S, motion_regressors
+from .channels import TURN_RAD, sample_rows
+from .response import EXPLAINED_ERROR_SHARE, TIME_ROUNDING_S, least_squares_residual, motion_regressors
 
 LAGS_S = (0.0, 0.005, 0.01, 0.02, 0.04)
 """s; lags from a command to its torque that are tried."""
@@ -58,7 +58,7 @@ def spikes(log: Log) -> Iterator[Finding | Log]:
     for j in range(len(log.joints)):
         level[:, j], hit[:, j] = _without_spikes(log, j)
     if hit.any():
-        joints, size = joints_where(log, np.asarray(hit.any(axis=0))), float(np.abs(tau - level).max())
+        joints, size = log.joints_where(np.asarray(hit.any(axis=0))), float(np.abs(tau - level).max())
         text = (
             f"tau: spikes in up to {100 * hit.mean(axis=0).max():.2g} % of the rows of {format_names(joints)}: single rows up to "
             f"{size:.3g} N m off the rows around and off what command and motion explain; left out"
@@ -152,7 +152,7 @@ def unsigned_torque(log: Log) -> Iterator[Finding]:
     for j in np.flatnonzero(hit):
         hit[j] = any(is_magnitude(tau[:, j], _pd_regressors(log, row, int(j), lag)) for lag in LAGS_S)
     if hit.any():
-        joints = joints_where(log, hit)
+        joints = log.joints_where(hit)
         text = (
             f"tau: has no sign on {format_names(joints)}: it never changes its sign, and the size of what a PD law asks for "
             "explains it better than that with an offset; expected a torque with its sign (leave it out if only its magnitude is "
@@ -192,7 +192,7 @@ def is_magnitude(values: Floats, signals: Floats) -> bool:
     Returns:
         True if the magnitude fits clearly better.
     """
-    signed = _squared_error(signals, values)
+    signed = float(np.sum(least_squares_residual(signals, values) ** 2))
     if signed < EXPLAINED_ERROR_SHARE * len(values) * np.var(values):
         return False
     signals = signals / (np.sqrt(np.mean(signals**2, axis=0)) + 1e-12)
@@ -207,8 +207,3 @@ def is_magnitude(values: Floats, signals: Floats) -> bool:
         total = signals @ np.linalg.lstsq(signals, signs * np.abs(values), rcond=1e-9)[0]
         least = min(least, float(np.sum((np.abs(values) - np.abs(total)) ** 2)))
     return least < MAGNITUDE_ERROR_RATIO * signed
-
-
-def _squared_error(signals: Floats, values: Floats) -> float:
-    """Sum of squared residuals of the least-squares fit of `values` on `signals`."""
-    return float(np.sum((values - signals @ np.linalg.lstsq(signals, values, rcond=1e-9)[0]) ** 2))
