@@ -14,7 +14,7 @@ import quadvel_dds
 from quadvel_bringup.nodes import NODES
 from quadvel_bringup.preflight import check_stack
 from quadvel_bringup.stack import PARAMETERS, Stack
-from quadvel_sysid.logs.columns import ColumnMap
+from quadvel_sysid.logs.readers.columns import ColumnMap
 
 quadvel_dds.install()
 

@@ -13,10 +13,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from quadvel_sysid.logs.checks import inspect
+from quadvel_sysid.logs.check_log import check_log
+from quadvel_sysid.logs.checks.response import MAX_LAG_S, Response, measure_response
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
-from quadvel_sysid.logs.response import MAX_LAG_S, Response, measure_response
 from tests.identification.hidden.cases import GROUP_OF, make_case
 
 SEED, INDICES = 77, (900, 901)
@@ -35,12 +35,12 @@ def responses(folder: Path) -> list[Response]:
     found = []
     for path in sorted(folder.glob("*.npz")):
         try:
-            inspection = inspect(read_log(path))
-            inspection.raise_refusal()
+            checked = check_log(read_log(path))
+            checked.raise_refusal()
         except LogError as error:
             print(f"refused: {error}")
             continue
-        response = measure_response(inspection.log)
+        response = measure_response(checked.log)
         found += [response] if response else []
     return found
 

@@ -23,6 +23,7 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
+from quadvel_sysid.options import DEFAULTS, IdentifyOptions
 from tests.identification import adapter, table
 from tests.identification.hidden.cases import GROUP_OF, make_case
 from tests.identification.verdicts import score_report
@@ -31,13 +32,14 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "results" / "identification_score.md"
 
 
-def score_case(kind: str, index: int, seed: int) -> dict[str, Any]:
+def score_case(kind: str, index: int, seed: int, options: IdentifyOptions = DEFAULTS) -> dict[str, Any]:
     """Generate one log, identify it and score the report.
 
     Args:
         kind: Kind of log, a key of `GROUP_OF`.
         index: Number of the log.
         seed: Seed of the benchmark.
+        options: Options of the identification.
 
     Returns:
         One row of the score. An exception of the identification is a row with `error`.
@@ -48,7 +50,7 @@ def score_case(kind: str, index: int, seed: int) -> dict[str, Any]:
         shown = [path.rename(Path(folder) / path.name) for path in paths]  # the truth stays in another folder
         start = time.process_time()
         try:
-            report = adapter.identify(shown[:1], shown[1:])
+            report = adapter.identify(shown[:1], shown[1:], options)
         except Exception as error:  # any exception is a verdict, and the benchmark continues
             found: dict[str, Any] = {
                 "kind": kind,

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import pytest
+import attrs
 
-from quadvel_sysid.model.torque_model import fit
-from quadvel_sysid.search import candidates
-from tests.identification.ablation import BASELINE, SWITCHES, table, without
-
-
-@pytest.mark.parametrize("switch", SWITCHES)
-def test_a_switch_replaces_existing_names_and_restores_them(switch: str) -> None:
-    before = candidates.MAX_FITTED_LAWS, fit._FAR_DELAY_CHANGES_S
-    with without(switch):
-        pass
-    assert before == (candidates.MAX_FITTED_LAWS, fit._FAR_DELAY_CHANGES_S)
+from quadvel_sysid.options import SEARCH_DEFAULTS, SearchOptions
+from tests.identification.ablation import BASELINE, SWITCHES, options_without, table
 
 
-def test_joined_switches_disable_all_devices() -> None:
-    with without("half as many fits+far delays"):
-        assert (candidates.MAX_FITTED_LAWS, fit._FAR_DELAY_CHANGES_S) == (3, ())
+def test_every_option_has_a_switch_that_turns_it_off() -> None:
+    assert options_without(BASELINE) == SEARCH_DEFAULTS
+    assert all(options_without(switch) != SEARCH_DEFAULTS for switch in SWITCHES if switch != BASELINE)
+    assert {name for fields in SWITCHES.values() for name in fields} == {
+        field.name for field in attrs.fields(SearchOptions)
+    }
+
+
+def test_joined_switches_turn_all_their_options_off() -> None:
+    options = options_without("half as many fits+far delays")
+    assert (options.fitted_effects, options.far_delays) == (3, False)
 
 
 def test_the_table_counts_changed_verdicts() -> None:

@@ -105,7 +105,7 @@ def test_intervals_of_joints_are_scored_one_by_one():
 
 
 def test_what_the_tool_raises_is_a_verdict_and_the_table_shows_it(monkeypatch):
-    def fail(logs, holdout):
+    def fail(logs, holdout, options):
         raise ValueError("broken")
 
     monkeypatch.setattr(adapter, "identify", fail)
@@ -115,7 +115,7 @@ def test_what_the_tool_raises_is_a_verdict_and_the_table_shows_it(monkeypatch):
 
 
 def test_the_tool_sees_the_log_and_not_the_truth(monkeypatch):
-    def check_folder(logs, holdout):
+    def check_folder(logs, holdout, options):
         (log,) = logs
         assert [path.name for path in log.parent.iterdir() if path.is_file()] == [log.name]
         assert "truth" not in str(log)

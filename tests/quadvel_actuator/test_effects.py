@@ -77,7 +77,7 @@ def test_an_effect_gives_the_same_torque_step_by_step_and_over_a_series(name):
     active = np.array([True, True, True, False])
     zero = np.zeros(4, dtype=int)
     series = Model(
-        Samples([log]), 0.001, np.ones((2, 4)), zero, np.zeros((2, 4)), zero,
+        Samples.of([log]), 0.001, np.ones((2, 4)), zero, np.zeros((2, 4)), zero,
         (AppliedEffect(_candidate(form), active, values, np.arange(4)),),
     ).predict()  # fmt: skip
     skip, tolerance = (5, 0.15) if name in LATE else (0, 2e-3 if name == "thermal_drift" else 1e-8)
@@ -91,7 +91,7 @@ def test_an_effect_gives_the_same_torque_step_by_step_and_over_a_series(name):
 def test_an_effect_of_another_package_needs_its_step_alone_to_be_run_over_a_series(name):
     """For any stretches and guesses; `series` of an effect is only a faster way."""
     t, q, dq, q_des = _motion(200)
-    samples = Samples([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
+    samples = Samples.of([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
     s = samples.at(0.0, 0.0, 0.0)
     s = attrs.evolve(s, start=s.start | (np.arange(200) % 70 == 0)[:, None])
     settings = {"on": "error"} if name == "backlash" else {}
@@ -114,7 +114,7 @@ def test_a_coupling_to_a_torque_does_not_carry_the_noise_of_its_measurement_over
         tau = noise * np.random.default_rng(0).standard_normal(q.shape)
         log = Log("coupled", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=tau)
         gains = np.ones((2, 4)), zero
-        torques.append(Model(Samples([log]), 0.0, *gains, np.zeros((2, 4)), zero, (coupled,)).predict())
+        torques.append(Model(Samples.of([log]), 0.0, *gains, np.zeros((2, 4)), zero, (coupled,)).predict())
     np.testing.assert_array_equal(*torques)
 
 
@@ -123,7 +123,7 @@ def test_a_coupling_has_an_offset_where_it_is_of_an_angle_and_nowhere_else():
     sources = [f"{NAMES[1]}/q", f"{NAMES[0]}/dq", f"{NAMES[0]}/tau", f"{NAMES[0]}/dq"]
     form = registry()["cross_coupling"].from_settings({"source": sources}, NAMES[:4])
     t, q, dq, q_des = _motion(300)
-    s = Samples([Log("still", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)]).at(0, 0, 0)
+    s = Samples.of([Log("still", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)]).at(0, 0, 0)
     torque = form.torque(s.stiffness_torque, s, {"a": np.zeros(4), "offset": np.ones(4)})
     np.testing.assert_array_equal(torque, np.tile([1.0, 0.0, 0.0, 0.0], (len(q), 1)))
     values = np.ones((2, 4))
@@ -160,7 +160,7 @@ def test_slopes_of_a_fit_are_those_of_the_torque(name, source, at):
     form = registry()[name].from_settings({"at": at, **forms.get(name, {})}, NAMES[:4])
     values = np.array([np.full(4, TRUTH[name].get(one, 0.0)) for one in form.names])
     every, zero = np.ones(4, dtype=bool), np.zeros(4, dtype=int)
-    samples = Samples([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
+    samples = Samples.of([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
     model = Model(
         samples, 0.0, np.ones((2, 4)), zero, np.repeat([[0.004], [0.002]], 4, axis=1), zero,
         (AppliedEffect(_candidate(form), every, values, np.arange(4)),),
@@ -206,7 +206,7 @@ def test_a_torque_added_at_the_joint_does_not_wait_for_the_output_delay(name):
     plain = 30.0 * (q_des - q) - 0.5 * dq
     late = np.concatenate([np.repeat(plain[:1], 4, axis=0), plain[:-4]])
     form = registry()[name](at="joint")
-    samples = Samples([Log("steps", JOINTS, t, q, dq, t, q_des, np.ones(q.shape, bool), tau=steps)])
+    samples = Samples.of([Log("steps", JOINTS, t, q, dq, t, q_des, np.ones(q.shape, bool), tau=steps)])
     p = {parameter: np.full(3, TRUTH[name][parameter]) for parameter in form.names}
     now = samples.at(0.0, 0.0, 0.0)
     np.testing.assert_allclose(steps[5:], (late + form.series(late, now, p))[5:], atol=1e-9)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import configparser
 import re
+import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -170,6 +172,36 @@ def test_pip_brings_what_the_sources_import_and_nothing_else() -> None:
     from_pip = {PIP[name] or name for name in modules if name in PIP}
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"].keys()
     assert requirements(*(extras - set(OF_TOOLS))) - BY_TORCH == from_pip
+
+
+def test_the_full_simulator_is_the_core_of_the_same_version() -> None:
+    core, full = (
+        tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+        for folder in (ROOT, ROOT / "packaging" / "quadvel")
+    )
+    assert full["version"] == core["version"]
+    assert full["dependencies"] == [f"{core['name']}[eval]=={core['version']}"]
+    assert full["requires-python"] == core["requires-python"]
+    assert {"mujoco", "onnxruntime", "matplotlib", "mcap"} <= requirements("eval")
+
+
+@pytest.mark.parametrize("package", [one for one in PACKAGES if one != MESSAGES])
+def test_files_that_are_no_modules_are_installed_by_pip_and_by_ament(package: str) -> None:
+    """By pip with the patterns of pyproject.toml, by ament with those of the package's setup.cfg."""
+    tracked = subprocess.run(
+        ["git", "ls-files", f"src/{package}/{package}"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split()
+    files = [
+        Path(file).relative_to(f"src/{package}/{package}") for file in tracked if not file.endswith(".py")
+    ]
+    pip = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["*"]
+    setup = configparser.ConfigParser()
+    setup.read(SRC / package / "setup.cfg")
+    ament = re.split(r"[,\s]+", setup.get("options.package_data", package, fallback="").strip())
+    for file in files:
+        if file.suffix not in (".md", ".typed"):  # which no program of ROS reads
+            assert any(file.match(pattern) for pattern in ament if pattern), f"setup.cfg: {file}"
+            assert any(file.match(pattern.removeprefix("**/")) for pattern in pip), f"pyproject.toml: {file}"
 
 
 def test_viser_is_held_at_the_minor_version_whose_start_is_known() -> None:

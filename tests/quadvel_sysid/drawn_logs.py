@@ -13,7 +13,7 @@ import attrs
 import numpy as np
 import typer
 
-from quadvel_sysid.logs.checks import inspect
+from quadvel_sysid.logs.check_log import check_log
 from quadvel_sysid.logs.log import Log
 
 Fields = dict[str, Any]
@@ -200,7 +200,7 @@ def main(seeds: int = 40, first: int = 1000) -> None:
     for name, (draw, expected) in EXPECTED.items():
         missed = 0
         for seed in range(first, first + seeds):
-            findings = inspect(draw(np.random.default_rng([seed, 1]), seed)).findings
+            findings = check_log(draw(np.random.default_rng([seed, 1]), seed)).findings
             told = [one for one in findings if one.kind != "note" and "separable" not in one.text]
             if tuple((one.kind, one.field) for one in told) != expected:
                 missed += 1

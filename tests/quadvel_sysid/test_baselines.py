@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from quadvel_sysid.cli import error_line
+from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.logs.read_log import read_log
 from quadvel_sysid.report.sanity_checks import contradictions
 from quadvel_sysid.statistics.baselines import baseline_errors, explained_share, torque_variance
@@ -22,13 +23,15 @@ def test_pd_law_leaves_friction_and_linear_filter_leaves_less(tmp_path: Path) ->
     np.savez(tmp_path / "log.npz", **given)
     log = read_log(tmp_path / "log.npz")
     first = np.broadcast_to((log.t < 4.0)[:, None], log.q.shape)
-    found = {name: one["heldout_mse"] for name, one in baseline_errors([log], first, ~first).items()}
+    found = {
+        name: one["heldout_mse"] for name, one in baseline_errors(Samples.of([log]), first, ~first).items()
+    }
     assert 0.05**2 < found["ridge"] < found["joint_pd"] < 0.6**2
     smooth = given["tau"] + 0.6 * np.tanh(given["dq"] / 0.05)
     np.savez(tmp_path / "log.npz", **given | {"tau": smooth * [1.0, 0.9, 1.1]})
     (error,) = {
         one["joint_pd"]["heldout_mse"]
-        for one in [baseline_errors([read_log(tmp_path / "log.npz")], first, ~first)]
+        for one in [baseline_errors(Samples.of([read_log(tmp_path / "log.npz")]), first, ~first)]
     }
     assert error < 0.1**2
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
-from quadvel_sysid.logs.checks import Inspection, inspect
+from quadvel_sysid.logs.check_log import CheckedLog, check_log
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
 
@@ -36,8 +36,8 @@ def log(**changes: Any) -> Log:
     return Log(name="a.npz", joints=JOINT_NAMES, **(values | changes))
 
 
-def texts(inspection: Inspection, kind: str) -> list[str]:
-    return [finding.text for finding in inspection.findings if finding.kind == kind]
+def texts(checked: CheckedLog, kind: str) -> list[str]:
+    return [finding.text for finding in checked.findings if finding.kind == kind]
 
 
 def exchanged(values: np.ndarray, a: int = 0, b: int = 4) -> np.ndarray:
@@ -58,27 +58,27 @@ def set_back(t: np.ndarray) -> np.ndarray:
 
 def test_finding_names_the_joint_with_the_defect() -> None:
     noise = np.where(np.arange(12) == 1, np.random.default_rng(0).normal(size=(2000, 12)), fields()["tau"])
-    warnings = texts(inspect(log(tau=noise)), "warning")
+    warnings = texts(check_log(log(tau=noise)), "warning")
     assert any(
         text.startswith("tau: does not answer the position error on FR_thigh_joint") for text in warnings
     )
     copied = fields()["q"].copy()
     copied[:, 1] = copied[:, 0]
-    warnings = texts(inspect(log(q=copied)), "warning")
+    warnings = texts(check_log(log(q=copied)), "warning")
     assert any(
         text.startswith("q: FR_thigh_joint and FR_hip_joint are the same to the bit") for text in warnings
     )
-    found = inspect(log(kp=of_one(np.full((2000, 12), 30.0), 0.0)))
+    found = check_log(log(kp=of_one(np.full((2000, 12), 30.0), 0.0)))
     assert texts(found, "refusal") == []
     assert "kp: 0 at times on FR_thigh_joint alone; left out there" in texts(found, "warning")
 
 
 def test_clean_log_yields_only_its_rate() -> None:
-    inspection = inspect(log())
-    assert texts(inspection, "warning") == []
-    assert texts(inspection, "refusal") == []
-    assert "t: 2000 rows over 4.00 s, 500 Hz" in texts(inspection, "note")[0]
-    assert inspection.log.valid.all()
+    checked = check_log(log())
+    assert texts(checked, "warning") == []
+    assert texts(checked, "refusal") == []
+    assert "t: 2000 rows over 4.00 s, 500 Hz" in texts(checked, "note")[0]
+    assert checked.log.valid.all()
 
 
 @pytest.mark.parametrize(
@@ -142,10 +142,10 @@ def test_clean_log_yields_only_its_rate() -> None:
     ],
 )
 def test_misleading_log_is_refused(changes: dict[str, Any], sentence: str) -> None:
-    inspection = inspect(log(**changes))
-    assert any(text.startswith(sentence) for text in texts(inspection, "refusal")), inspection.findings
+    checked = check_log(log(**changes))
+    assert any(text.startswith(sentence) for text in texts(checked, "refusal")), checked.findings
     with pytest.raises(LogError, match=r"^a\.npz: "):
-        inspection.raise_refusal()
+        checked.raise_refusal()
 
 
 @pytest.mark.parametrize("share", [0.02, 0.1])
@@ -155,7 +155,7 @@ def test_strong_spring_at_one_joint_is_not_a_wrong_unit(share: float) -> None:
     error, angle = (given["q_des"] - given["q"])[:, 1], given["q"][:, 1] - given["q"][:, 1].mean()
     spring = (1.0 - share) * KP * (error @ (error - error.mean())) / (error @ angle) * angle
     tau = given["tau"] - np.outer(spring, np.arange(12) == 1)
-    assert texts(inspect(log(tau=tau)), "refusal") == []
+    assert texts(check_log(log(tau=tau)), "refusal") == []
 
 
 def test_gaps_dropped_and_repeated_rows_are_counted() -> None:
@@ -166,7 +166,7 @@ def test_gaps_dropped_and_repeated_rows_are_counted() -> None:
         given[name][100:400:10] = given[name][99:399:10]
     shape = given["q"].shape
     same = {"kp": np.full(shape, 30.0), "kd": np.full(shape, 0.5), "valid": np.ones(shape, bool)}
-    warnings = texts(inspect(log(**given, t_cmd=given["t"], **same)), "warning")
+    warnings = texts(check_log(log(**given, t_cmd=given["t"], **same)), "warning")
     assert "t: 1 gap, the longest of 0.304 s at 1.00 s" in warnings
     assert "t: about 37 rows were dropped, one at a time" in warnings
     assert any(text.startswith("q: 30 rows (") for text in warnings)
@@ -178,8 +178,8 @@ def test_clipped_channels_and_joints_at_rest_are_named() -> None:
     dq[:, 7] = 0.0
     tau = fields()["tau"]
     tau[:, 2] = np.clip(tau[:, 2], -0.5, 0.5)
-    inspection = inspect(log(q=q, dq=dq, tau=tau))
-    found = {finding.text.split(":")[1].strip(): finding.joints for finding in inspection.findings}
+    checked = check_log(log(q=q, dq=dq, tau=tau))
+    found = {finding.text.split(":")[1].strip(): finding.joints for finding in checked.findings}
     assert found["never moves"] == ("RR_thigh_joint",)
     assert found["clipped (N m)"] == ("FR_calf_joint",)
 
@@ -187,21 +187,19 @@ def test_clipped_channels_and_joints_at_rest_are_named() -> None:
 def test_names_that_contradict_the_model_are_reported() -> None:
     order = list(np.roll(np.arange(12), 1))
     moved = {name: fields()[name][:, order] for name in ("q", "dq", "tau", "q_des")}
-    warnings = texts(inspect(log(**moved)), "warning")
+    warnings = texts(check_log(log(**moved)), "warning")
     assert any(text.startswith("joint_names: q contradicts the model's range") for text in warnings)
     strange = attrs.evolve(log(), joints=(*JOINT_NAMES[:11], "RL_knee_joint"))
-    assert "joint_names: RL_knee_joint: not among" in " ".join(texts(inspect(strange), "warning"))
+    assert "joint_names: RL_knee_joint: not among" in " ".join(texts(check_log(strange), "warning"))
 
 
 def test_a_gain_of_zero_is_left_out() -> None:
     kp = np.full((2000, 12), 30.0)
     kp[1000:] = 0.0
-    inspection = inspect(log(kp=kp))
-    assert (
-        "kp: 0 (damping, switched off or torque control) 2.00 s to the end" in texts(inspection, "warning")[0]
-    )
-    assert inspection.log.valid[:1000].all()
-    assert not inspection.log.valid[1000:].any()
+    checked = check_log(log(kp=kp))
+    assert "kp: 0 (damping, switched off or torque control) 2.00 s to the end" in texts(checked, "warning")[0]
+    assert checked.log.valid[:1000].all()
+    assert not checked.log.valid[1000:].any()
 
 
 @pytest.mark.parametrize("gains_known", [True, False])
@@ -213,9 +211,9 @@ def test_damping_and_switching_off_show_in_the_torque(gains_known: bool, damping
     tau += np.random.default_rng(1).normal(0.0, 0.05, tau.shape)
     q_des = np.where(off[:, None], given["q_des"][~off][-1] + 0.1, given["q_des"])
     gains = {} if gains_known else {"kp": None, "kd": None}
-    inspection = inspect(log(tau=tau, q_des=q_des, **gains))
-    assert any("tau: the torque no longer answers" in text for text in texts(inspection, "warning"))
-    valid = inspection.log.valid.any(axis=1)
+    checked = check_log(log(tau=tau, q_des=q_des, **gains))
+    assert any("tau: the torque no longer answers" in text for text in texts(checked, "warning"))
+    valid = checked.log.valid.any(axis=1)
     assert not valid[off].any()
     assert valid[given["t"] < 2.3].all()
 
@@ -230,61 +228,59 @@ def test_drive_under_a_constant_load_is_not_switched_off() -> None:
     tau = 30.0 * error - 0.5 * one["dq"]
     pushed = error[:, 0] > 0.07
     tau[pushed] -= tau[pushed].mean()
-    assert inspect(Log(name="a.npz", joints=("a",), tau=tau, **one, **gains)).log.valid.all()
+    assert check_log(Log(name="a.npz", joints=("a",), tau=tau, **one, **gains)).log.valid.all()
 
 
 def test_saturation_and_friction_are_not_damping() -> None:
     given = fields()
     tau = np.clip(given["tau"], -0.6, 0.6) - 0.3 * np.tanh(given["dq"] / 0.02)
-    assert inspect(log(tau=tau)).log.valid.all()
+    assert check_log(log(tau=tau)).log.valid.all()
 
 
 def test_feed_forward_torque_is_subtracted_before_the_checks() -> None:
     given = fields()
     held = np.clip(given["q_des"], NOMINAL_Q - 0.05, NOMINAL_Q + 0.05)
-    inspection = inspect(log(q_des=held, tau_ff=KP * (given["q_des"] - held)))
-    assert texts(inspection, "warning") == texts(inspection, "refusal") == []
-    assert inspection.log.valid.all()
+    checked = check_log(log(q_des=held, tau_ff=KP * (given["q_des"] - held)))
+    assert texts(checked, "warning") == texts(checked, "refusal") == []
+    assert checked.log.valid.all()
     weight = np.full(held.shape, -40.0)
-    inspection = inspect(log(tau=given["tau"] + weight, tau_ff=weight))
-    assert texts(inspection, "warning") == texts(inspection, "refusal") == []
+    checked = check_log(log(tau=given["tau"] + weight, tau_ff=weight))
+    assert texts(checked, "warning") == texts(checked, "refusal") == []
 
 
 def test_unknown_gains_and_missing_torque_are_reported() -> None:
-    notes = texts(inspect(log(kp=None, kd=None)), "note")
+    notes = texts(check_log(log(kp=None, kd=None)), "note")
     assert "kp: not in the log; it is fitted" in notes
     assert "kd: not in the log; it is fitted" in notes
-    notes = texts(inspect(log(tau=None)), "note")
+    notes = texts(check_log(log(tau=None)), "note")
     assert any(one.startswith("tau: not in the log; effects") for one in notes)
 
 
 def test_log_without_torque_and_gains_is_refused() -> None:
-    (text,) = texts(inspect(log(kd=None, tau=None)), "refusal")
+    (text,) = texts(check_log(log(kd=None, tau=None)), "refusal")
     assert text.startswith("tau, kd: not in the log; expected the torque, or the commanded gains")
-    assert texts(inspect(log(kp=None, kd=None, tau=None), gains=(30.0, 0.5)), "refusal") == []
+    assert texts(check_log(log(kp=None, kd=None, tau=None), gains=(30.0, 0.5)), "refusal") == []
 
 
 def test_given_gains_are_not_reported_missing() -> None:
     assert not any(
-        "kp: not in" in text for text in texts(inspect(log(kp=None, kd=None), gains=(30.0, 0.5)), "note")
+        "kp: not in" in text for text in texts(check_log(log(kp=None, kd=None), gains=(30.0, 0.5)), "note")
     )
 
 
 def test_constant_torque_is_treated_as_not_logged() -> None:
-    inspection = inspect(log(tau=np.zeros((2000, 12))))
-    assert inspection.log.tau is None
-    assert "tau: is 0 throughout, which is no measurement; treated as not logged" in texts(
-        inspection, "warning"
-    )
+    checked = check_log(log(tau=np.zeros((2000, 12))))
+    assert checked.log.tau is None
+    assert "tau: is 0 throughout, which is no measurement; treated as not logged" in texts(checked, "warning")
 
 
 def test_inseparable_parameters_are_reported() -> None:
     still = np.tile(fields()["q_des"].mean(axis=0), (2000, 1))
-    warnings = texts(inspect(log(q_des=still)), "warning")
+    warnings = texts(check_log(log(q_des=still)), "warning")
     assert "q_des: the command never changes, so that no delay of the command can be identified" in warnings
     slow = np.linspace(0.0, 4.0, 2000)[:, None] * np.ones(12)
     steady = {"q": 0.1 * slow, "dq": np.full((2000, 12), 0.1), "q_des": 0.1 * slow + 0.05}
-    sentences = " ".join(finding.text for finding in inspect(log(**steady, tau=None)).findings)
+    sentences = " ".join(finding.text for finding in check_log(log(**steady, tau=None)).findings)
     assert "kp and torque offset are separable only through changes of the position error" in sentences
 
 
@@ -299,9 +295,9 @@ measured = pytest.mark.skipif(
 @pytest.mark.parametrize("without", [(), ("kp", "kd"), ("tau",)])
 def test_the_damping_after_a_walk_is_noticed(number: int, begins: float, without: tuple[str, ...]) -> None:
     walk = read_log(MEASURED / f"go2_walk_{number}.npz")
-    inspection = inspect(attrs.evolve(walk, **dict.fromkeys(without)))
-    inspection.raise_refusal()
-    valid = inspection.log.valid.any(axis=1)
+    checked = check_log(attrs.evolve(walk, **dict.fromkeys(without)))
+    checked.raise_refusal()
+    valid = checked.log.valid.any(axis=1)
     assert not valid[walk.t > begins + 0.15].any()
     before = (walk.t > walk.t_cmd[0]) & (walk.t < begins - 0.5)
     assert valid[before].all()
@@ -310,9 +306,9 @@ def test_the_damping_after_a_walk_is_noticed(number: int, begins: float, without
 @measured
 def test_measured_logs_with_commands_are_accepted() -> None:
     for name in ("go2_inair", "go2_replay_50hz"):
-        inspection = inspect(read_log(MEASURED / f"{name}.npz"))
-        inspection.raise_refusal()
-        assert inspection.log.valid.all()
+        checked = check_log(read_log(MEASURED / f"{name}.npz"))
+        checked.raise_refusal()
+        assert checked.log.valid.all()
 
 
 @measured
@@ -327,5 +323,5 @@ def test_commanded_speed_is_not_a_clock_offset(tmp_path):
     log, kd = fields(), 4.0
     dq_des = np.gradient(log["q_des"], log["t"], axis=0)
     tau = log["tau"] + kd * (dq_des - log["dq"]) + KD * log["dq"]
-    found = inspect(read_log(npz(tmp_path / "log.npz", dq_des=dq_des, tau=tau, kd=kd)))
+    found = check_log(read_log(npz(tmp_path / "log.npz", dq_des=dq_des, tau=tau, kd=kd)))
     assert not [one.text for one in found.findings if one.kind == "refusal"]

@@ -21,7 +21,7 @@ BEGIN, END = 2.0, 4.0  # s, of a stand
 
 
 def starts_of(log: Log) -> np.ndarray:
-    return cluster_starts(Samples([log]))
+    return cluster_starts(Samples.of([log]))
 
 
 def standing(log: Log, sway: float, rate: float) -> Log:
@@ -64,7 +64,7 @@ def test_quantised_torque_has_rounding_noise_and_constant_torque_the_noise_of_ot
     tau = log.tau.copy()
     tau[:, 1] = np.round(tau[:, 1] / 4.0) * 4.0
     tau[:, 2] = 0.0
-    samples = Samples([attrs.evolve(log, tau=tau)])
+    samples = Samples.of([attrs.evolve(log, tau=tau)])
     noise = noise_variance(samples, samples.evaluated, samples.tau)
     assert noise[1] == pytest.approx(4.0**2 / 12.0, rel=1e-6)
     assert noise[2] == np.mean(noise[:2])
@@ -86,6 +86,6 @@ def test_whiteness_and_normality_are_tested_for_each_joint() -> None:
 
 
 def test_the_noise_variance_needs_no_model() -> None:
-    samples = Samples([record(parameters(), joints=2, seconds=5.0)])
+    samples = Samples.of([record(parameters(), joints=2, seconds=5.0)])
     found = noise_variance(samples, samples.evaluated, samples.tau)
     np.testing.assert_allclose(found, 0.066, rtol=0.15)

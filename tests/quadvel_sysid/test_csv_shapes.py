@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quadvel_sysid.logs import csv_table
-from quadvel_sysid.logs.columns import ColumnMap, Source
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
+from quadvel_sysid.logs.readers import csv_table
+from quadvel_sysid.logs.readers.columns import ColumnMap, Source
 
 RNG = np.random.default_rng(7)
 T = np.round(np.arange(60) * 0.005, 3)

@@ -23,7 +23,7 @@ def _log(seconds, seed=0, **values):
 
 
 def _fitted(log, input_delay, output_delay):
-    samples = Samples([log])
+    samples = Samples.of([log])
     delays = np.repeat([[input_delay], [output_delay]], 2, axis=1)
     model = Model(samples, 0.001, np.ones((2, 2)), ONE, delays, ONE)
     return fit(model, samples.evaluated, 20), samples.evaluated
@@ -77,7 +77,7 @@ def _model(drive, log, window, delays):
     """A model with the gains of the drive."""
     gains = np.array([1.0 + drive.delta_kp / drive.kp_ref, 1.0 + drive.delta_kd / drive.kd_ref])
     each = np.repeat(np.asarray(delays)[:, None], 2, axis=1)
-    return Model(Samples([log]), window, gains[:, None] * np.ones(2), ONE, each, ONE)
+    return Model(Samples.of([log]), window, gains[:, None] * np.ones(2), ONE, each, ONE)
 
 
 def _run(drive, log, delays):
@@ -120,7 +120,7 @@ def _driven(row, command, seed):
 
 def test_the_longest_of_the_equivalent_delays_on_a_grid_is_chosen():
     log = _driven(0.001, 0.001, 1)
-    samples = Samples([log])
+    samples = Samples.of([log])
     eam = fit_eam(samples, samples.evaluated)
     delays = np.stack([eam.input_delay, eam.output_delay])
     model = Model(samples, eam.window, eam.gains, ONE, delays, ONE)
@@ -131,7 +131,7 @@ def test_the_longest_of_the_equivalent_delays_on_a_grid_is_chosen():
 def test_the_global_minimum_over_the_delays_is_found_with_step_commands():
     """With a step command every 5.25 ms, a fit from 2 ms away ends in a local minimum."""
     log = _driven(0.001, 0.00525, 2)
-    samples = Samples([log])
+    samples = Samples.of([log])
     off = np.repeat([[0.0095], [0.0005]], 2, axis=1)
     stuck = fit(Model(samples, 0.0, np.ones((2, 2)), ONE, off, ONE), samples.evaluated)
     found = fit_delay_profile(stuck, samples.evaluated)

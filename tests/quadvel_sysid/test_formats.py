@@ -154,7 +154,7 @@ def test_missing_optional_dependency_is_named(
     for module in ("h5py", "pyarrow", "pyarrow.parquet"):
         monkeypatch.setitem(sys.modules, module, None)
     (tmp_path / name).write_bytes(b"x")
-    with pytest.raises(LogError, match=r"pip install 'quadvel\[formats\]'"):
+    with pytest.raises(LogError, match=r"pip install 'quadvel-core\[formats\]'"):
         read_log(tmp_path / name)
 
 
@@ -277,7 +277,7 @@ def test_an_encrypted_archive_is_refused(tmp_path: Path) -> None:
 def test_a_mat_file_that_grows_is_refused_within_little_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from quadvel_sysid.logs import matlab
+    from quadvel_sysid.logs.readers import matlab
 
     monkeypatch.setattr(matlab, "MAX_UNPACKED_BYTES", 20_000_000)
     packer = zlib.compressobj(1)
@@ -293,7 +293,7 @@ def test_a_mat_file_that_grows_is_refused_within_little_memory(
 def test_a_parquet_file_of_billions_of_rows_is_refused_unread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from quadvel_sysid.logs import raw
+    from quadvel_sysid.logs.readers import raw
 
     monkeypatch.setattr(raw, "MAX_VALUES", 400)
     parquet(tmp_path / "log.parquet")

@@ -8,12 +8,13 @@ import pytest
 from simulated_joints import NAMES, TABLE_4, parameters, record
 
 from quadvel_actuator import ActuatorParameters, Effect
-from quadvel_sysid.data.identification_data import prepare
+from quadvel_sysid.data.dataset import Dataset
 from quadvel_sysid.data.plain_model import fit_eam
 from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.identify import identify
-from quadvel_sysid.logs.dataset import Dataset
+from quadvel_sysid.logs.check_log import check_logs
 from quadvel_sysid.logs.excerpts import cut_excerpts
+from quadvel_sysid.options import IdentifyOptions
 
 JOINTS = NAMES[:2]
 
@@ -23,7 +24,7 @@ def _truth(*effects):
 
 
 def test_the_eam_finds_the_truth_of_table_4():
-    samples = Samples([record(parameters(input_delay=0.0068, output_delay=0.0013), 6, 5.0)])
+    samples = Samples.of([record(parameters(input_delay=0.0068, output_delay=0.0013), 6, 5.0)])
     eam = fit_eam(samples, samples.evaluated)
     assert abs((eam.gains[0, 0] - 1) * 30 - -0.706) < 0.05 * 30 * 0.05
     assert abs(eam.gains[1, 0] * 0.5 - 0.479) < 0.2 * 0.479
@@ -49,7 +50,7 @@ def test_friction_is_found_next_to_a_joint_without_torque_measurement():
 def test_gains_in_a_log_override_the_argument():
     log = record(_truth(), 2, 3.0, 500, seed=4)
     with_them = attrs.evolve(log, kp=np.full(log.q_des.shape, 30.0), kd=np.full(log.q_des.shape, 0.5))
-    before = identify([with_them], gains=(60.0, 1.0)).report["before"]
+    before = identify([with_them], options=IdentifyOptions(gains=(60.0, 1.0))).report["before"]
     assert before == identify([with_them]).report["before"]
 
 
@@ -76,7 +77,9 @@ def test_disturbances_in_the_fitted_excerpts_alone_are_not_confirmed():
     logs = [record(_truth(), 2, 6.0, 500, seed=4, distort=pushed) for _ in range(2)]
     again = np.random.default_rng(1).normal(0.0, np.sqrt(TABLE_4["noise"]), logs[1].tau.shape)
     logs[1] = attrs.evolve(logs[1], tau=logs[1].tau + again)
-    report = identify(logs[:1], logs[1:], values=3000).report  # two excerpts of 0.75 s each
+    report = identify(
+        logs[:1], logs[1:], IdentifyOptions(max_values=3000)
+    ).report  # two excerpts of 0.75 s each
     unconfirmed = " ".join(report["warnings"])
     assert all(f"{one['name']} is not confirmed" in unconfirmed for one in report["effects"])
 
@@ -91,9 +94,9 @@ def test_excerpts_of_a_slow_log_have_enough_rows():
 def test_a_long_log_is_released_after_its_excerpts_are_copied():
     log = record(_truth(), 2, 6.0, 500, seed=4)
     alive = [weakref.ref(array) for array in (log.q, log.dq, log.tau, log.q_des, log.t)]
-    data = prepare(Dataset.inspect_all([log]), values=3000)
+    dataset = Dataset.prepare(*check_logs([log]), max_values=3000)
     del log
-    assert sum(len(log.t) for log in data.logs) == 1500
+    assert sum(len(log.t) for log in dataset.logs) == 1500
     assert [array() for array in alive] == [None] * len(alive)
 
 
@@ -123,7 +126,9 @@ def test_the_report_states_gains_of_each_joint_and_torques_above_the_limit():
         return tau * np.array([1.0, 0.6])
 
     base = attrs.evolve(ActuatorParameters.default(), torque_limit=2.0)
-    report = identify([record(_truth(), 2, 3.0, 500, seed=4, distort=weaker)], base=base).report
+    report = identify(
+        [record(_truth(), 2, 3.0, 500, seed=4, distort=weaker)], options=IdentifyOptions(base=base)
+    ).report
     assert report["effects"] == []
     error = f"{report['after']['heldout_mse']:.3g} N^2 m^2, with common ones to {report['before']['heldout_mse']:.3g}"
     assert error in report["decision"]

@@ -75,7 +75,7 @@ def test_a_heldout_log_with_other_joints_is_refused(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_leaves_the_folder_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object) -> None:
+    def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli, "read_log", interrupted)

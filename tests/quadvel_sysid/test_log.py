@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from quadvel_description.robot import JOINT_NAMES
-from quadvel_sysid.logs import raw
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
+from quadvel_sysid.logs.readers import raw
 
 sys.path.insert(0, str(Path(__file__).parent))
 from joint_logs import csv, fields, mcap, npz

@@ -7,6 +7,7 @@ import pytest
 
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.read_log import read_log
+from quadvel_sysid.options import IdentifyOptions
 
 LEG = ("FR_hip", "FR_thigh", "FR_calf")
 GAINS = (35.0, 0.5)  # of the recording lab's driver; the logs contain no gains
@@ -25,7 +26,7 @@ def walks():
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)], ids=["1 to 2", "2 to 1"])
 def test_a_model_of_one_walk_halves_the_error_of_the_eam_on_the_other(walks, order):
     fitted, heldout = (walks[k] for k in order)
-    report = identify([fitted], [heldout], gains=GAINS).report
+    report = identify([fitted], [heldout], IdentifyOptions(gains=GAINS)).report
     effects = [effect["name"] for effect in report["effects"]]
     assert "armature" in effects[:2]
     assert report["after"]["heldout_mse"] < 0.5 * report["before"]["heldout_mse"]

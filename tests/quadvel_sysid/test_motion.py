@@ -17,6 +17,7 @@ from quadvel_sysid.data.motion import imply_torque
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
+from quadvel_sysid.options import IdentifyOptions
 
 JOINTS = NAMES[:2]
 
@@ -52,7 +53,7 @@ def test_log_without_torque_and_gains_is_refused():
     log = attrs.evolve(_swinging(), kp=None, kd=None)
     with pytest.raises(LogError, match="tau, kp, kd: not in the log"):
         identify([log])
-    assert identify([log], gains=(30.0, 0.5)).report["effects"] == []
+    assert identify([log], options=IdentifyOptions(gains=(30.0, 0.5))).report["effects"] == []
 
 
 def _hung(friction, seconds=5.0, seed=0):
@@ -120,7 +121,7 @@ def test_a_measured_leg_in_the_air_is_never_replayed_worse_than_before():
     leg = [name.startswith("FL") for name in log.joints]
     states = {name: getattr(log, name)[:, leg] for name in ("q", "dq", "valid", "q_des", "kp", "kd")}
     one = attrs.evolve(log, joints=tuple(np.array(log.joints)[leg].tolist()), **states)
-    report = identify([one], values=6000).report
+    report = identify([one], options=IdentifyOptions(max_values=6000)).report
     assert 0.01 < min(report["motion"]["inertia"]["value"]) < max(report["motion"]["inertia"]["value"]) < 0.1
     for name in ("heldout_q_rms_rad", "heldout_dq_rms_rad_s"):
         assert report["after"][name] <= report["before"][name]

@@ -13,12 +13,13 @@ from simulated_joints import NAMES, parameters, record
 from quadvel_actuator import Effect
 from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.identify import identify
+from quadvel_sysid.options import IdentifyOptions
 from quadvel_sysid.parallel import parallel_map
 
 
 @pytest.fixture(scope="module")
 def samples():
-    return Samples([record(parameters(joints=1), joints=1, seconds=1.0)])
+    return Samples.of([record(parameters(joints=1), joints=1, seconds=1.0)])
 
 
 def test_results_equal_those_of_one_core_and_refer_to_the_same_samples(samples):
@@ -67,5 +68,7 @@ def test_the_report_does_not_depend_on_the_number_of_cores():
     joints = NAMES[:2]
     truth = attrs.evolve(parameters((Effect("quadratic_drag", joints[:1], {"c": 0.05}),)), joints=joints)
     log = record(truth, 2, 3.0, 500, seed=4)
-    one, two = (json.dumps(identify([log], cores=n).report, default=float) for n in (1, 2))
+    one, two = (
+        json.dumps(identify([log], options=IdentifyOptions(cores=n)).report, default=float) for n in (1, 2)
+    )
     assert one == two

@@ -6,9 +6,10 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import ActuatorParameters, Effect
-from quadvel_sysid.export.replay import STRETCH_S, Legs, replay_deviations, stretch_starts
+from quadvel_sysid.export.legs import Legs, replay_deviations, stretch_starts
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log, LogError
+from quadvel_sysid.options import IdentifyOptions
 
 CALF = ("FR_calf_joint",)
 IDEAL = attrs.evolve(ActuatorParameters.ideal(), torque_limit=45.0)
@@ -46,9 +47,9 @@ def test_excess_torque_moves_the_legs_as_a_free_body():
     legs = Legs.load("go2", CALF)
     angle, speed = replay_deviations(log, IDEAL, legs, np.array([0.1, 0.5]))
     inertia = legs.inertia(np.array([[-1.5]]))[0, 0, 0]
-    assert angle.shape == speed.shape == (round(STRETCH_S / 0.001), 2, 1)
-    assert speed[-1].ravel() == pytest.approx([STRETCH_S / inertia] * 2, rel=0.01)
-    assert angle[-1].ravel() == pytest.approx([0.5 * STRETCH_S**2 / inertia] * 2, rel=0.02)
+    assert angle.shape == speed.shape == (round(Legs.stretch_s / 0.001), 2, 1)
+    assert speed[-1].ravel() == pytest.approx([Legs.stretch_s / inertia] * 2, rel=0.01)
+    assert angle[-1].ravel() == pytest.approx([0.5 * Legs.stretch_s**2 / inertia] * 2, rel=0.02)
 
 
 def test_model_with_the_measured_torque_does_not_deviate():
@@ -68,15 +69,15 @@ def test_stretches_lie_in_the_given_rows_and_not_across_a_gap():
     late = attrs.evolve(log, t=np.where(log.t > 1.5, log.t + 0.1, log.t))
     for begin in stretch_starts(late, rows):
         assert begin >= 0.04 - 1e-9
-        assert begin + STRETCH_S <= 0.6 or begin >= 0.8
-        assert begin + STRETCH_S <= 1.5 + 1e-9 or begin >= 1.6
+        assert begin + Legs.stretch_s <= 0.6 or begin >= 0.8
+        assert begin + Legs.stretch_s <= 1.5 + 1e-9 or begin >= 1.6
     assert len(stretch_starts(late, rows)) == 2 + 3 + 2
 
 
 def test_report_states_replay_deviations_before_and_after():
     friction = Effect("coulomb_friction", NAMES[:3], {"c": 1.5, "v_0": 0.05})
     log = record(attrs.evolve(parameters((friction,)), joints=NAMES[:3]), 3, 3.0, 500, seed=2)
-    report = identify([log], robot="aliengo").report
+    report = identify([log], options=IdentifyOptions(robot="aliengo")).report
     before, after = report["replay"]["before"], report["replay"]["after"]
     assert after["q_rms_rad"] < 0.5 * before["q_rms_rad"]
     assert len(after["q_rms_rad_per_joint"]) == 3
@@ -110,11 +111,11 @@ def test_a_file_that_is_no_description_is_named(tmp_path):
 def test_a_log_without_torque_is_not_identified_with_a_replay():
     log = record(attrs.evolve(parameters(), joints=NAMES[:2]), 2, 2.0, 1000, load=0.0)
     with pytest.raises(LogError, match="tau: not in the log, expected the torque to replay"):
-        identify([attrs.evolve(log, tau=None)], robot="aliengo")
+        identify([attrs.evolve(log, tau=None)], options=IdentifyOptions(robot="aliengo"))
     with pytest.raises(
         LogError, match=r"kd: not in the log, expected the commanded gains \(or --gains KP KD\)"
     ):
-        identify([attrs.evolve(log, kd=None)], robot="aliengo")
+        identify([attrs.evolve(log, kd=None)], options=IdentifyOptions(robot="aliengo"))
 
 
 def test_a_log_without_torque_is_not_replayed():

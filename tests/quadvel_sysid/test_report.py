@@ -100,8 +100,16 @@ def identification(**changes: Any) -> Identification:
     after = 6 * np.sin(9 * t)
     measured = after + friction + noise
     measured[50:60] = np.nan
-    trace = Trace(t, measured, after * 1.2, after, after + friction)
-    shape = Shape("stribeck_friction", JOINTS[2], "dq", "rad/s", speed, friction + noise, noise)
+    trace = Trace(t=t, measured=measured, pd=after * 1.2, before=after, after=after + friction)
+    shape = Shape(
+        effect="stribeck_friction",
+        joint=JOINTS[2],
+        signal="dq",
+        unit="rad/s",
+        x=speed,
+        before=friction + noise,
+        after=noise,
+    )
     return Identification(
         {**copy.deepcopy(REPORT), **changes},
         ActuatorParameters.default(),

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 import yaml
 
-from quadvel_sysid.logs.checks import Inspection, inspect, markdown_table
-from quadvel_sysid.logs.columns import ColumnMap
+from quadvel_sysid.logs.check_log import CheckedLog, check_log
+from quadvel_sysid.logs.checks.table import markdown_table
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
+from quadvel_sysid.logs.readers.columns import ColumnMap
 
 sys.path.insert(0, str(Path(__file__).parent))
 from servo_logs import KP, recorded
@@ -24,18 +25,18 @@ from servo_logs import KP, recorded
 SEEDS = (3, 14)
 
 
-def inspect_file(folder: Path, log: dict[str, Any]) -> Inspection:
+def inspect_file(folder: Path, log: dict[str, Any]) -> CheckedLog:
     """Write the log to a file, read it and inspect it."""
     np.savez(folder / "log.npz", **log)
-    return inspect(read_log(folder / "log.npz"))
+    return check_log(read_log(folder / "log.npz"))
 
 
-def texts(inspection: Inspection, *kinds: str) -> list[str]:
-    return [finding.text for finding in inspection.findings if finding.kind in kinds]
+def texts(checked: CheckedLog, *kinds: str) -> list[str]:
+    return [finding.text for finding in checked.findings if finding.kind in kinds]
 
 
-def refusal(inspection: Inspection) -> str:
-    (text,) = texts(inspection, "refusal")
+def refusal(checked: CheckedLog) -> str:
+    (text,) = texts(checked, "refusal")
     return text
 
 
@@ -302,7 +303,7 @@ def test_measured_logs_of_servos_are_refused_for_what_they_lack(
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(names))
     read = read_log(MEASURED / name, names=ColumnMap.load(tmp_path / "map.yaml"))
     with pytest.raises(LogError) as refused:
-        inspect(read).raise_refusal()
+        check_log(read).raise_refusal()
     assert sentence in str(refused.value)
 
 

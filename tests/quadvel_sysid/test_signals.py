@@ -18,7 +18,7 @@ def _log(seconds=3.0, seed=2):
 
 
 def test_signals_of_few_rows_are_those_of_all():
-    samples = Samples([_log(), _log(seed=3)])
+    samples = Samples.of([_log(), _log(seed=3)])
     rows = np.arange(0, len(samples.t), 7)
     few = samples.take_rows(rows)
     assert len(few.t) == len(rows) < len(samples.t) / 6
@@ -39,7 +39,7 @@ def test_few_rows_lie_at_all_places_between_two_commands(every):
 
 
 def test_each_joint_reads_signals_at_its_own_delays():
-    samples = Samples([_log()])
+    samples = Samples.of([_log()])
     mixed = samples.at(np.array([0.004, 0.009]), np.array([0.001, 0.003]), 0.001)
     for joint, pair in enumerate(((0.004, 0.001), (0.009, 0.003))):
         for name in ("q", "dq", "q_des", "kp"):
@@ -49,7 +49,7 @@ def test_each_joint_reads_signals_at_its_own_delays():
 
 def test_grid_of_deadbands_leaves_few_errors_between_its_values():
     """Each error between two values is a jump of the torque that a slope along the width misses."""
-    samples = Samples([_log(seconds=1.0)])
+    samples = Samples.of([_log(seconds=1.0)])
     s = samples.at(0.009, 0.003, 0.0)
     starts = DeadbandCandidate(Deadband("hard")).initial_guesses(s, samples.tau, samples.tau)
     widths = np.array([one["width"] for one in starts])
@@ -61,6 +61,6 @@ def test_grid_of_deadbands_leaves_few_errors_between_its_values():
 def test_slower_log_is_evaluated_as_well():
     fast, slow = _log(seconds=2.0), _log(seconds=2.0, seed=3)
     every = np.arange(len(slow.t)) % 4 == 0
-    samples = Samples([fast, slow.select_rows(every)])
+    samples = Samples.of([fast, slow.select_rows(every)])
     assert samples.evaluated[samples.log_of_row == 1].mean() > 0.9
     assert samples.start[samples.log_of_row == 1].sum() == 1

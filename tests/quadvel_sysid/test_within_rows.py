@@ -45,7 +45,7 @@ def test_a_slew_limit_is_simulated_between_rows():
     one = np.zeros(1, dtype=np.intp)
     gains = np.array([[30.0], [0.0]])
     limit = AppliedEffect(candidate, np.ones(1, dtype=bool), np.array([[rate]]), one)
-    model = Model(Samples([log]), 0.0, gains, one, np.zeros((2, 1)), one, (limit,))
+    model = Model(Samples.of([log]), 0.0, gains, one, np.zeros((2, 1)), one, (limit,))
     limited = np.abs(asked - tau) > 0.05
     assert limited.mean() > 0.2
     assert np.sqrt(np.mean((model.predict()[:, 0] - tau)[10:] ** 2)) < 0.008
@@ -56,7 +56,7 @@ def _of_one_joint(log, candidate, value, input_delay=0.0):
     applied = AppliedEffect(candidate, np.ones(1, dtype=bool), np.array([[value]]), one)
     gains = np.array([[30.0], [1.0]])
     delays = np.array([[input_delay], [0.0]])
-    return Model(Samples([log]), 0.0, gains, one, delays, one, (applied,))
+    return Model(Samples.of([log]), 0.0, gains, one, delays, one, (applied,))
 
 
 def test_a_lag_is_recomputed_at_other_delays_with_the_same_commands():

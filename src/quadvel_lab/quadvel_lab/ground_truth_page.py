@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from quadvel_eval.replay import GROWTH_INTERVAL_MS
 from quadvel_sysid.report.figures import AFTER, BEFORE, MEASURED, svg_figure
-from quadvel_sysid.report.page import html_document, html_table, html_tiles, number_text
+from quadvel_sysid.report.rendering import html_document, html_table, html_tiles, number_text
 
 Entry = Mapping[str, Any]
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import attrs
 import typer
 from rich.console import Console
 from rich.markup import escape
@@ -19,17 +21,18 @@ from typing_extensions import override
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_recordings.output import output_folder
 
-from .logs.checks import Inspection
-from .logs.columns import ColumnMap
-from .logs.dataset import Dataset
+from .logs.check_log import CheckedLog, check_logs
+from .logs.log import Log
 from .logs.read_log import read_log
-from .logs.recordings import Topics
+from .logs.readers.columns import ColumnMap
+from .logs.readers.recordings import Topics
 from .memory import keep_freed_arrays, return_large_arrays
+from .options import IdentifyOptions
 from .statistics.baselines import FILTER_SPAN_S
 
 if TYPE_CHECKING:
-    from .data.identification_data import IdentificationData
-    from .data.identification_data import Progress as ProgressCallback
+    from .data.dataset import Dataset
+    from .report.identification import Identification
 
 MULTI_VALUE_OPTIONS = ("--holdout", "--joints")
 """Options that take several values after one name."""
@@ -159,47 +162,57 @@ def identify(
     Other files in the folder are kept. Ctrl-C leaves the folder unchanged.
     """
     messages = Console(stderr=True)
-    topics = Topics(state_topic, command_topic)
     try:
-        _run(logs, holdout or [], out, base, gains, joints, columns, topics, robot, cores, messages)
+        output_folder(out)
+        return_large_arrays()
+        names = ColumnMap() if columns is None else ColumnMap.load(columns)
+        read = partial(read_log, joints=joints, names=names, topics=Topics(state_topic, command_topic))
+        parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
+        options = IdentifyOptions(gains=gains, base=parameters, robot=robot)
+        found = _identify(logs, holdout or [], read, options, cores, messages)
+        _write(found, out, messages)
     except KeyboardInterrupt:
         messages.print("stopped; nothing was written")
         raise typer.Exit(130) from None
 
 
-def _run(
-    logs: Sequence[Path],
-    holdout: Sequence[Path],
-    out: Path,
-    base: Path | None,
-    gains: tuple[float, float] | None,
-    joints: Sequence[str] | None,
-    columns: Path | None,
-    topics: Topics,
-    robot: str | None,
+def _identify(
+    train_paths: Sequence[Path],
+    heldout_paths: Sequence[Path],
+    read: Callable[[Path], Log],
+    options: IdentifyOptions,
     cores: int | None,
     messages: Console,
-) -> None:
-    """Read the logs, identify the model, write the report and print a summary."""
-    output_folder(out)
-    names = ColumnMap() if columns is None else ColumnMap.load(columns)
-    return_large_arrays()
-    parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
+) -> Identification:
+    """Read the logs and identify the model; findings and progress go to `messages`."""
     parts = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*parts, console=messages, transient=True) as bar:
+    with Progress(*parts, console=messages, transient=True) as bar, threadpool_limits(1):
         task = bar.add_task("reading", total=1.0)
 
         def on_progress(share: float, text: str) -> None:
             bar.update(task, completed=share, description=text)
 
-        data, long = _load_data(logs, holdout, joints, names, topics, gains, messages, on_progress)
+        def prepare() -> tuple[Dataset, bool]:
+            """Read and check the logs; release long ones, and return whether they are long."""
+            train, heldout = ([read(path) for path in paths] for paths in (train_paths, heldout_paths))
+            checked = check_logs(train, heldout, options.gains, lambda one: print_findings(one, messages))
+            long = sum(one.log.q.size for part in checked for one in part) >= _LONG_LOG_VALUES
+            # Imported here, so that errors in the files appear before the engine is loaded.
+            from .data.dataset import Dataset
+
+            return Dataset.prepare(*checked, options.max_values, on_progress), long
+
+        dataset, long = prepare()
         if not long:
             keep_freed_arrays()
-        from .identify import identify_prepared
+        from .identify import identify_dataset
 
         cores = cores or (1 if long else min(DEFAULT_CORES, len(os.sched_getaffinity(0))))
-        with threadpool_limits(1):  # of each copy of this process: they share the cores
-            found = identify_prepared(data, parameters, cores, on_progress, robot)
+        return identify_dataset(dataset, attrs.evolve(options, cores=cores), on_progress)
+
+
+def _write(found: Identification, out: Path, messages: Console) -> None:
+    """Write the report and print a summary."""
     from .report.report import write_report
 
     write_report(found, out)
@@ -211,29 +224,6 @@ def _run(
     for text in found.report["warnings"]:
         messages.print(escape(f"warning: {text}"), style=STYLE["warning"], soft_wrap=True, highlight=False)
     console.print(f"written: {out}/report.html, report.json, actuator.yaml", soft_wrap=True, highlight=False)
-
-
-def _load_data(
-    logs: Sequence[Path],
-    holdout: Sequence[Path],
-    joints: Sequence[str] | None,
-    names: ColumnMap,
-    topics: Topics,
-    gains: tuple[float, float] | None,
-    messages: Console,
-    on_progress: ProgressCallback,
-) -> tuple[IdentificationData, bool]:
-    """Read, check and prepare the logs; return whether they are long, and release them if so."""
-    with threadpool_limits(1):
-        fitted, heldout = (
-            [read_log(one, joints, names, topics) for one in paths] for paths in (logs, holdout)
-        )
-        data = Dataset.inspect_all(fitted, heldout, gains, lambda one: print_findings(one, messages))
-        long = sum(log.q.size for log in data.logs) >= _LONG_LOG_VALUES
-        # Imported here, so that errors in the files appear before the engine is loaded.
-        from .data.identification_data import prepare
-
-        return prepare(data, progress=on_progress), long
 
 
 def error_line(report: Mapping[str, Any]) -> str:
@@ -278,15 +268,15 @@ def replay_line(replay: Mapping[str, Any]) -> str:
     )
 
 
-def print_findings(inspection: Inspection, messages: Console) -> None:
+def print_findings(checked: CheckedLog, messages: Console) -> None:
     """Print the findings about a log.
 
     Args:
-        inspection: The findings.
+        checked: The log with its findings.
         messages: Console to print to.
     """
-    messages.print(escape(inspection.log.name), style="bold", soft_wrap=True, highlight=False)
-    for finding in inspection.findings:
+    messages.print(escape(checked.log.name), style="bold", soft_wrap=True, highlight=False)
+    for finding in checked.findings:
         line = f"  {finding.kind:8} {finding.text}"
         messages.print(escape(line), style=STYLE[finding.kind], soft_wrap=True, highlight=False)
 

@@ -1,7 +1,7 @@
 """Parallel map over forked worker processes, with the results of a serial run.
 
 A worker is a fork of this process and therefore shares its data. Results return by pickle, without
-the samples, which this process holds already.
+one large object that this process holds already.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
-from .data.signals import Samples
 from .memory import trim_heap
 
 Result = TypeVar("Result")
@@ -25,17 +24,16 @@ _MAX_TASKS = 2048
 """Maximum number of tasks: a pipe of one page holds so many 2-byte numbers."""
 
 
-def parallel_map(work: Callable[[int], Result], count: int, cores: int, samples: Samples) -> list[Result]:
+def parallel_map(work: Callable[[int], Result], count: int, cores: int, shared: object) -> list[Result]:
     """Call a function for the numbers 0 to count - 1, on several cores.
 
     This process works as well.
 
     Args:
-        work: Function of the task number. Its result may refer to `samples`, and to no other
-            samples.
+        work: Function of the task number. Its result may refer to `shared`.
         count: Number of tasks.
         cores: Processes, this one included.
-        samples: Samples that results refer to; they are not copied.
+        shared: Large object that results refer to; it is not copied.
 
     Returns:
         Results in the order of the task numbers.
@@ -55,7 +53,7 @@ def parallel_map(work: Callable[[int], Result], count: int, cores: int, samples:
     try:
         # One after the other, so that a failure finds those already started in the list.
         for _ in range(min(cores, count) - 1):
-            workers.append(_Worker(work, queue, samples))  # noqa: PERF401
+            workers.append(_Worker(work, queue, shared))  # noqa: PERF401
         found = {k: work(k) for k in _claim_tasks(queue)}
         for worker in workers:
             found |= worker.results()
@@ -84,13 +82,13 @@ def _claim_tasks(queue: int) -> Iterator[int]:
 class _Worker:
     """A fork of this process that works on tasks until none are left."""
 
-    def __init__(self, work: Callable[[int], Any], queue: int, samples: Samples) -> None:
-        self._samples = samples
+    def __init__(self, work: Callable[[int], Any], queue: int, shared: object) -> None:
+        self._shared = shared
         reader, writer = os.pipe()
         signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPT_SIGNALS)  # until the worker has its own handler
         self._pid = os.fork()
         if self._pid == 0:
-            _run_worker(work, queue, writer, samples)
+            _run_worker(work, queue, writer, shared)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPT_SIGNALS)
         os.close(writer)
         self._answer = os.fdopen(reader, "rb")
@@ -108,7 +106,7 @@ class _Worker:
         answer = self._answer.read()
         if not answer:
             raise ChildProcessError("a worker process was killed; check that there is enough memory")
-        found = _Unpickler(io.BytesIO(answer), self._samples).load()
+        found = _Unpickler(io.BytesIO(answer), self._shared).load()
         if isinstance(found, Exception):
             raise found
         return dict(found)
@@ -120,7 +118,7 @@ class _Worker:
         os.waitpid(self._pid, 0)
 
 
-def _run_worker(work: Callable[[int], Any], queue: int, writer: int, samples: Samples) -> None:
+def _run_worker(work: Callable[[int], Any], queue: int, writer: int, shared: object) -> None:
     """Main function of a worker process; does not return."""
     try:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # end with the parent
@@ -132,7 +130,7 @@ def _run_worker(work: Callable[[int], Any], queue: int, writer: int, samples: Sa
         except Exception as error:
             found = error
         answer = io.BytesIO()
-        _Pickler(answer, samples).dump(found)
+        _Pickler(answer, shared).dump(found)
         with os.fdopen(writer, "wb") as file:
             file.write(answer.getvalue())
     finally:
@@ -140,22 +138,22 @@ def _run_worker(work: Callable[[int], Any], queue: int, writer: int, samples: Sa
 
 
 class _Pickler(pickle.Pickler):
-    """Pickler that stores a reference instead of the samples."""
+    """Pickler that stores a reference instead of the shared object."""
 
-    def __init__(self, file: io.BytesIO, samples: Samples) -> None:
+    def __init__(self, file: io.BytesIO, shared: object) -> None:
         super().__init__(file, pickle.HIGHEST_PROTOCOL)
-        self._samples = samples
+        self._shared = shared
 
     def persistent_id(self, value: Any) -> str | None:
-        return "samples" if value is self._samples else None
+        return "shared" if value is self._shared else None
 
 
 class _Unpickler(pickle.Unpickler):
-    """Unpickler that resolves the reference to the samples."""
+    """Unpickler that resolves the reference to the shared object."""
 
-    def __init__(self, file: io.BytesIO, samples: Samples) -> None:
+    def __init__(self, file: io.BytesIO, shared: object) -> None:
         super().__init__(file)
-        self._samples = samples
+        self._shared = shared
 
-    def persistent_load(self, name: str) -> Samples:
-        return self._samples
+    def persistent_load(self, name: str) -> object:
+        return self._shared

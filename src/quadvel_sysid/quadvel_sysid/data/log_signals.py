@@ -37,13 +37,14 @@ class LogSignals:
         signals: All of these signals by name.
     """
 
-    def __init__(self, log: Log, steady: float, known: Collection[str]) -> None:
+    def __init__(self, log: Log, steady: float, known: Collection[str], sharp: bool) -> None:
         """Prepare the signals.
 
         Args:
             log: The log.
             steady: Half width of the lines that smooth q and dq, s; 0 for none.
             known: Which of kp and kd are used as logged.
+            sharp: Whether accelerations are kept sharp where a command arrives.
         """
         self.log, self.origin = log, float(log.t[0]) if log.recording_start is None else log.recording_start
         self.t, self.t_cmd = as_double(log.t), as_double(log.t_cmd)
@@ -75,6 +76,7 @@ class LogSignals:
             if values.any()
         }
         self.signals: dict[str, Array] = {**self.states, **self.commands, **self.gains}
+        self._sharp = sharp
         self._slopes: dict[float, Array] = {}
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
 
@@ -123,7 +125,7 @@ class LogSignals:
         Returns:
             (N, J) acceleration, rad/s^2.
         """
-        if name == "ddq":
+        if name == "ddq" or not self._sharp:
             return interpolation.interpolate(self._slope_of_dq(name)[:, joints], *self.locate(at))
         key = (name, *delays.tolist())
         if key not in self._smooth:

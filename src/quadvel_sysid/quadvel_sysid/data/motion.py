@@ -9,7 +9,8 @@ short stretches. There is no model of contacts: the robot has to be suspended.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import attrs
 import numpy as np
@@ -22,9 +23,6 @@ from ..logs.log import Log, LogError
 from .plain_model import MAX_INPUT_DELAY_S
 from .signals import Samples
 
-STRETCH_S = 0.05
-"""s that are replayed from a measured state before the next one is used."""
-
 _AVERAGING_S = 0.008
 """s over which an acceleration is computed; encoders are too coarse for less."""
 _DELAY_STEP_S = 0.0005
@@ -35,10 +33,6 @@ _MAX_LIMB_JOINTS = 4
 """Most joints of a limb, which carry each other."""
 _RIDGE = 1e-5
 """Ridge penalty on the regression's normalised weights, times the number of rows."""
-
-
-Replay = dict[str, float]
-"""Root mean square deviations of a replay: `q_rms_rad` and `dq_rms_rad_s`."""
 
 
 @attrs.frozen(eq=False)
@@ -148,6 +142,9 @@ class Body:
         limbs: The limbs, which do not affect each other.
     """
 
+    stretch_s: ClassVar = 0.05
+    """s that are replayed from a measured state before the next one is used."""
+
     limbs: tuple[Limb, ...]
 
     @property
@@ -192,6 +189,45 @@ class Body:
             found[:, at] = limb.accelerations(q[:, at], dq[:, at], torque[:, at])
         return found
 
+    def replay_errors(
+        self, logs: Sequence[Log], parameters: ActuatorParameters, rows: Bools
+    ) -> dict[str, Any]:
+        """Replay the commands of logs and compute the root mean square deviations.
+
+        Args:
+            logs: Averaged logs, from `imply_torque`.
+            parameters: The actuator model.
+            rows: (N, J) rows of all logs that count.
+
+        Returns:
+            Deviations of angles (rad) and speeds (rad/s): `q_rms_rad` and `dq_rms_rad_s`.
+        """
+        errors = np.concatenate([_replay_log(log, parameters, self) for log in logs], axis=1)
+        count = max(int(rows.sum()), 1)
+        sizes = np.sqrt(np.sum(np.where(rows, errors, 0.0) ** 2, axis=(1, 2)) / count)
+        return {"q_rms_rad": float(sizes[0]), "dq_rms_rad_s": float(sizes[1])}
+
+    def report_section(self, before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+        """Build the section of report.json on the replay.
+
+        Args:
+            before: Replay errors of the plain EAM.
+            after: Replay errors of the corrected model.
+
+        Returns:
+            The section by its name.
+        """
+        return {
+            "motion": {
+                "inertia": {"value": self.inertia.tolist(), "unit": "kg m^2"},
+                "replayed_s": self.stretch_s,
+                "text": "No torque was logged. It is inferred from the motion, so that the inertia contains an armature and "
+                "the torque offset contains an encoder bias.",
+                "before": before,
+                "after": after,
+            }
+        }
+
 
 def average_over_steps(log: Log) -> tuple[Log, Array]:
     """Average a log over steps of `_AVERAGING_S` and compute the accelerations in them.
@@ -213,15 +249,13 @@ def average_over_steps(log: Log) -> tuple[Log, Array]:
     whole = np.array([log.valid[a : b + 1].all(axis=0) for a, b in zip(first, last, strict=True)])
     whole &= dt < 1.5 * count * log.period
     half = 0.5 * count * log.period
-    voltage = None if log.voltage is None else log.voltage[first]
-    temperature = None if log.temperature is None else log.temperature[first]
     coarse = attrs.evolve(
         log,
         t=0.5 * (log.t[first] + log.t[last]),
         t_cmd=log.t_cmd + half,
         valid=whole,
-        temperature=temperature,
-        voltage=voltage,
+        temperature=None if log.temperature is None else log.temperature[first],
+        voltage=None if log.voltage is None else log.voltage[first],
         tau=None,
         q=_trapezoid_mean(q, first, count),
         dq=_trapezoid_mean(dq, first, count),
@@ -254,7 +288,7 @@ def imply_torque(log: Log, body: Body | None = None) -> tuple[Log, Body]:
             f"{log.name}: tau, kp: both are missing, expected the torque or the gains (--gains KP KD)"
         )
     coarse, ddq = average_over_steps(log)
-    samples = Samples([coarse])
+    samples = Samples.of([coarse])
     if body is None:
         delays = np.arange(0.0, MAX_INPUT_DELAY_S, _DELAY_STEP_S)
         body = min((_fit_body(samples, ddq, delay) for delay in delays), key=lambda one: one[1])[0]
@@ -293,24 +327,6 @@ def _group_limbs(joints: Sequence[str]) -> list[Indices]:
     ]
 
 
-def replay_errors(logs: Sequence[Log], parameters: ActuatorParameters, body: Body, rows: Bools) -> Replay:
-    """Replay the commands of logs and compute the root mean square deviations.
-
-    Args:
-        logs: Averaged logs, from `imply_torque`.
-        parameters: The actuator model.
-        body: The dynamics.
-        rows: (N, J) rows of all logs that count.
-
-    Returns:
-        Deviations of angles (rad) and speeds (rad/s).
-    """
-    errors = np.concatenate([_replay_log(log, parameters, body) for log in logs], axis=1)
-    count = max(int(rows.sum()), 1)
-    sizes = np.sqrt(np.sum(np.where(rows, errors, 0.0) ** 2, axis=(1, 2)) / count)
-    return {"q_rms_rad": float(sizes[0]), "dq_rms_rad_s": float(sizes[1])}
-
-
 def _replay_log(log: Log, parameters: ActuatorParameters, body: Body) -> Array:
     """Deviations (2, N, J) of q and dq in the replay of one log."""
     count = max(1, int(np.ceil(log.period / _MAX_STEP_S - 1e-9)))
@@ -324,10 +340,10 @@ def _replay_log(log: Log, parameters: ActuatorParameters, body: Body) -> Array:
         none if x is None else np.asarray(x) for x in (log.kp, log.kd, log.dq_des, log.tau_ff)
     )
     q, dq = np.asarray(log.q, dtype=float), np.asarray(log.dq, dtype=float)
-    # Semi-implicit Euler steps of the fitted dynamics under the model's torque. Every STRETCH_S, and
+    # Semi-implicit Euler steps of the fitted dynamics under the model's torque. Every stretch, and
     # after a gap, the state is set to the measured one.
     errors = np.zeros((2, *log.q.shape))
-    every = max(2, round(STRETCH_S / log.period))
+    every = max(2, round(body.stretch_s / log.period))
     after_gap = log.after_gap
     angle, speed = q[0], dq[0]
     for n, commands in enumerate(packets):

@@ -63,7 +63,7 @@ def encoder_variance(samples: Samples, rows: Bools, kp: float, kd: float) -> Arr
     Returns:
         Variance, (J,), N^2 m^2.
     """
-    q, dq = (np.concatenate([one.states[name] for one in samples.logs]) for name in ("q", "dq"))
+    q, dq = (np.concatenate([one.states[name] for one in samples.sources.series]) for name in ("q", "dq"))
     return kp**2 * _difference_variance(q, samples, rows) + kd**2 * _difference_variance(dq, samples, rows)
 
 

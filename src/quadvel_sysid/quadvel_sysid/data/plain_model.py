@@ -157,26 +157,26 @@ class _CrossProducts:
         self._joints, self._count = len(samples.joints), int(rows.sum())
         self._aa, self._ab, self._bb, self._az, self._bz, self._zz = np.zeros((6, len(totals), len(outputs)))
         offset = 0
-        for log in samples.logs:
-            for first in range(0, len(log.t), _CHUNK_ROWS):
-                t = log.t[first : first + _CHUNK_ROWS]
+        for series in samples.sources.series:
+            for first in range(0, len(series.t), _CHUNK_ROWS):
+                t = series.t[first : first + _CHUNK_ROWS]
                 here = slice(offset + first, offset + first + len(t))
                 if rows[here].any():
-                    self._add(log, t, samples.tau[here], rows[here].astype(float))
-            offset += len(log.t)
+                    self._add(series, t, samples.tau[here], rows[here].astype(float))
+            offset += len(series.t)
 
-    def _add(self, log: LogSignals, t: Array, tau: Array, keep: Array) -> None:
+    def _add(self, series: LogSignals, t: Array, tau: Array, keep: Array) -> None:
         """Add the rows at the times `t` of one log; `keep` is 1 on samples to fit, 0 on others."""
         # With a = C - Q, b = D - V and z = tau - F, each product of sums separates, for example
         #     a'a = C'C - 2 C'Q + Q'Q,   C by the row of the sum, Q by the column.
-        packet = log.command_rows(t - self._at)
-        kp, kd = (log.gains[name][packet] * keep for name in ("kp", "kd"))
+        packet = series.command_rows(t - self._at)
+        kp, kd = (series.gains[name][packet] * keep for name in ("kp", "kd"))
         c, d, f = (
-            _stack_rows(log.command_at(name, t - delay, self._window) * factor for delay in self._totals)
+            _stack_rows(series.command_at(name, t - delay, self._window) * factor for delay in self._totals)
             for name, factor in (("q_des", kp), ("dq_des", kd), ("tau_ff", keep))
         )
         q, v = (
-            _stack_rows(log.state_at(name, t - delay) * factor for delay in self._outputs)
+            _stack_rows(series.state_at(name, t - delay) * factor for delay in self._outputs)
             for name, factor in (("q", kp), ("dq", kd))
         )
         z = (tau * keep).ravel() - f

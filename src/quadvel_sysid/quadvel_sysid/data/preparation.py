@@ -15,7 +15,8 @@ import numpy as np
 from ..logs.excerpts import has_jitter, restore_even_clock
 from ..logs.findings import Finding
 from ..logs.log import Log, LogError
-from .identification_data import IdentificationData
+from ..options import SEARCH_DEFAULTS, SearchOptions
+from .dataset import Dataset
 from .noise import encoder_variance, noise_variance
 from .plain_model import Eam, fit_eam
 from .signals import Samples
@@ -59,41 +60,49 @@ class Preprocessed:
 
 
 def preprocess(
-    data: IdentificationData, windows: Sequence[float], shortest: float = MIN_BLOCK_S
+    dataset: Dataset,
+    windows: Sequence[float],
+    shortest: float = MIN_BLOCK_S,
+    options: SearchOptions = SEARCH_DEFAULTS,
 ) -> tuple[Preprocessed, list[tuple[str, Finding]]]:
     """Choose the time stamps and the averaging that explain the torque best.
 
     Args:
-        data: The checked logs.
+        dataset: The logs.
         windows: Steps (s) of the drive that the plain model tries.
         shortest: Shortest block, s.
+        options: Options of the search.
 
     Returns:
         The preprocessed logs, and a note for each choice other than the logs as they are.
     """
 
     def fit_logs(logs: Sequence[Log], steady: float = 0.0) -> Preprocessed:
-        samples = Samples(logs, steady)
-        parts = split_rows(samples, data, shortest)
+        samples = Samples.of(logs, steady, options)
+        parts = split_rows(samples, dataset, shortest, options.cluster_motion_rad)
         return Preprocessed(samples, parts, fit_eam(samples, parts.fit, windows=windows))
 
-    logs: Sequence[Log] = data.logs
-    best, notes = fit_logs(logs), []
-    if any(has_jitter(log) for log in logs):
+    logs: Sequence[Log] = dataset.logs
+    prepared, notes = fit_logs(logs), []
+    if options.even_clocks and any(has_jitter(log) for log in logs):
         even = [restore_even_clock(log) for log in logs]
         other = fit_logs(even)
-        if other.eam.mse <= _EVEN_CLOCK_ERROR_RATIO * best.eam.mse:
-            logs, best = even, other
+        if other.eam.mse <= _EVEN_CLOCK_ERROR_RATIO * prepared.eam.mse:
+            logs, prepared = even, other
             text = "the even clock of the sender explains the torque better and was restored"
             notes.append(("t", f"t: the stamps jitter as those of received messages do; {text}"))
-    best, steady = _choose_averaging(best, lambda steady: fit_logs(logs, steady))
+    steady = 0.0
+    if options.averaged_encoders:
+        prepared, steady = _choose_averaging(prepared, lambda steady: fit_logs(logs, steady))
     if steady:
         text = f"is averaged out over {1e3 * steady:.3g} ms to either side"
         notes.append(("dq", f"q, dq: their noise, on which the drive did not act, {text}"))
-    return best, [(logs[0].name, Finding("note", field, (), text)) for field, text in notes]
+    return prepared, [(logs[0].name, Finding("note", field, (), text)) for field, text in notes]
 
 
-def split_rows(samples: Samples, data: IdentificationData, shortest: float) -> DataSplit:
+def split_rows(
+    samples: Samples, dataset: Dataset, shortest: float, motion: float = SEARCH_DEFAULTS.cluster_motion_rad
+) -> DataSplit:
     """Divide the rows into blocks that are fitted, used for selection, or held out.
 
     Of five consecutive blocks, two are fitted, two are used for selection and one is held out. If
@@ -101,8 +110,9 @@ def split_rows(samples: Samples, data: IdentificationData, shortest: float) -> D
 
     Args:
         samples: Rows of all logs.
-        data: The checked logs.
+        dataset: The logs.
         shortest: Shortest block, s.
+        motion: Motion of some joint that ends a cluster, rad.
 
     Returns:
         The parts, (N, J) masks.
@@ -110,11 +120,11 @@ def split_rows(samples: Samples, data: IdentificationData, shortest: float) -> D
     Raises:
         LogError: A joint has too few rows in one part.
     """
-    spans = [one.log.duration for one in samples.logs]
+    spans = [log.duration for log in samples.logs]
     length = float(np.clip(min(spans) / _MIN_BLOCKS, shortest, _MAX_BLOCK_S))
     block = np.floor(samples.t / length).astype(int)
-    if data.has_heldout:
-        report = samples.log_of_row >= data.fitted_count
+    if dataset.heldout:
+        report = samples.log_of_row >= len(dataset.train)
         select = (block % 2 == 1) & ~report
     else:
         report, select = block % 5 == 4, np.isin(block % 5, (1, 3))
@@ -125,60 +135,49 @@ def split_rows(samples: Samples, data: IdentificationData, shortest: float) -> D
         if (count < _MIN_ROWS).any():
             joint = samples.joints[int(np.argmin(count))]
             raise LogError(
-                f"{samples.logs[0].log.name}: valid/{joint}: {int(count.min())} rows to be {word}, "
+                f"{samples.logs[0].name}: valid/{joint}: {int(count.min())} rows to be {word}, "
                 f"expected {_MIN_ROWS} or more"
             )
-    overlap = 0 if data.body is None else 1
-    return DataSplit(parts["fitted"], parts["selecting"], parts["reported"], cluster_starts(samples), overlap)
-
-
-def reference_gains(samples: Samples) -> tuple[float, float]:
-    """Compute the gains that deviations are relative to: the medians over all logs.
-
-    Args:
-        samples: Rows of all logs.
-
-    Returns:
-        kp (N m/rad) and kd (N m s/rad).
-    """
-    kp, kd = (
-        float(np.median(np.concatenate([one.gains[name].ravel() for one in samples.logs])))
-        for name in ("kp", "kd")
+    return DataSplit(
+        fit=parts["fitted"],
+        select=parts["selecting"],
+        report=parts["reported"],
+        cluster_starts=cluster_starts(samples, motion),
+        noise_overlap=0 if dataset.body is None else 1,
     )
-    return max(kp, 1e-6), max(kd, 1e-6)
 
 
 def _choose_averaging(
-    best: Preprocessed, fit_logs: Callable[[float], Preprocessed]
+    prepared: Preprocessed, fit_logs: Callable[[float], Preprocessed]
 ) -> tuple[Preprocessed, float]:
     """Average q and dq over wider windows while this reduces the error; return the half width, s."""
-    samples, parts, eam = best.samples, best.parts, best.eam
+    samples, parts, eam = prepared.samples, prepared.parts, prepared.eam
     rows, gains = parts.fit_or_select, np.ones(2) if samples.commanded else eam.gains.mean(axis=1)
     noise = noise_variance(samples, rows, samples.tau - eam.predict(samples)).mean()
     noisy = (
-        encoder_variance(samples, rows, *gains * reference_gains(samples)).mean()
+        encoder_variance(samples, rows, *gains * samples.reference_gains).mean()
         >= _ENCODER_NOISE_SHARE * noise
     )
 
-    def error_of(one: Preprocessed) -> float:
+    def error_of(prepared: Preprocessed) -> float:
         """Error with friction; relative to the error without it if noise hardly affects the PD law."""
-        return _error_with_friction(one) - (0.0 if noisy else one.eam.mse)
+        return _error_with_friction(prepared) - (0.0 if noisy else prepared.eam.mse)
 
-    chosen, least = 0.0, error_of(best)
+    chosen, least = 0.0, error_of(prepared)
     widths = _AVERAGING_ROWS * samples.period
     for steady in widths[widths <= (_MAX_AVERAGING_S if noisy else _MAX_AVERAGING_BLURRED_S)]:
         other = fit_logs(steady)
         error = error_of(other)
         if error < least - _MIN_AVERAGING_GAIN * noise:
-            best, chosen, least = other, float(steady), error
+            prepared, chosen, least = other, float(steady), error
         elif error > least:
             break
-    return best, chosen
+    return prepared, chosen
 
 
-def _error_with_friction(one: Preprocessed) -> float:
+def _error_with_friction(prepared: Preprocessed) -> float:
     """Mean squared error of the plain model with friction, whose step noisy speeds blur most."""
-    samples, eam, rows = one.samples, one.eam, one.parts.fit
+    samples, eam, rows = prepared.samples, prepared.eam, prepared.parts.fit
     dq = samples.at(eam.input_delay, eam.output_delay, eam.window).dq
     left, total = samples.tau - eam.predict(samples), 0.0
     for j, chosen in enumerate(rows.T):

@@ -10,7 +10,6 @@ are those of the measured samples.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from copy import copy
 from functools import cached_property, partial
 from typing import Any, TypeVar
 
@@ -20,6 +19,7 @@ import numpy as np
 from quadvel_description.arrays import Array, Bools, Indices
 
 from ..logs.log import Log
+from ..options import SEARCH_DEFAULTS, SearchOptions
 from .log_signals import ALL_JOINTS, Joints, LogSignals, as_double
 
 Made = TypeVar("Made")
@@ -33,9 +33,6 @@ _MAX_CACHED_VALUES = 400_000
 """Values of one signal in all cached sets together, about."""
 
 _ROW_FIELDS = ("log_of_row", "t", "tau", "start", "dt", "evaluated", "row", "lead")
-
-INSTANTS_PER_ROW = 2
-"""Instants of a row, itself the last, for effects that are integrated between the rows."""
 _JOINT_FIELDS = ("q", "dq", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature")
 
 _GOLDEN_RATIO = 0.5 * (np.sqrt(5.0) - 1.0)
@@ -163,77 +160,164 @@ def _constant_signals(logs: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
     }
 
 
+def _stretches(log: Log) -> tuple[Bools, Array, Bools]:
+    """For each row: whether a stretch begins, the spacing before, whether the past is known."""
+    # The past of a row is known if SETTLING_S have passed since the last gap and since the first
+    # command.
+    start = log.after_gap
+    start[0] = True
+    steps = np.where(start, log.period, np.diff(log.t, prepend=log.t[0]))
+    began = np.maximum.accumulate(np.where(start, log.t, -np.inf))
+    known = (log.t - began >= SETTLING_S) & (log.t - SETTLING_S >= log.t_cmd[0])
+    return np.asarray(start), np.asarray(steps, dtype=float), np.asarray(known)
+
+
+@attrs.frozen(eq=False)
+class Sources:
+    """The signals of all logs that samples are read from.
+
+    Attributes:
+        series: Signals of each log.
+        sent: (M, J) q_des of every command row of all logs, rad.
+        first_packet: Number of command rows before each log, and of all of them.
+        first_row: Number of state rows before each log, and of all of them.
+        constant: Signals that are equal in every row of all logs, as that row.
+    """
+
+    series: tuple[LogSignals, ...]
+    sent: Array
+    first_packet: Indices
+    first_row: Indices
+    constant: Mapping[str, Array]
+
+    @classmethod
+    def of(cls, series: Sequence[LogSignals]) -> Sources:
+        """Collect the signals of logs.
+
+        Args:
+            series: Signals of each log.
+
+        Returns:
+            The sources.
+        """
+        return cls(
+            tuple(series),
+            np.concatenate([one.commands["q_des"] for one in series]),
+            np.cumsum([0, *(len(one.t_cmd) for one in series)]),
+            np.cumsum([0, *(len(one.t) for one in series)]),
+            _constant_signals([one.signals for one in series]),
+        )
+
+    def first(self, count: int) -> Sources:
+        """Keep the first logs.
+
+        Args:
+            count: Number of logs.
+
+        Returns:
+            Their sources.
+        """
+        return attrs.evolve(self, series=self.series[:count], sent=self.sent[: self.first_packet[count]])
+
+
+@attrs.frozen(eq=False, kw_only=True)
 class Samples:
     """Rows of all logs one after the other: N rows of J joints, with their torque and signals.
 
-    If kp or kd is not known in every log, it counts as 1, so that the fit yields the gain itself.
-    The same holds for a kd that is 0 in all logs (`undamped`): its deviation is the drive's own
+    `Samples.of` makes them from logs; all other methods return samples of some of the rows. If kp
+    or kd is not known in every log, it counts as 1, so that the fit yields the gain itself. The
+    same holds for a kd that is 0 in all logs (`undamped`): its deviation is the drive's own
     damping, in units of 1 N m s/rad.
 
     Attributes:
-        logs: Signals of each log.
-        joints: Names of the joints.
+        sources: Signals of all logs.
         commanded: Whether the commanded gains are known.
         undamped: Whether the commanded kd is 0 throughout.
+        instants_per_row: Instants of a row, itself the last, for effects that are integrated
+            between the rows.
+        period: Median spacing of the rows, s.
         log_of_row: (N,) index of each row's log.
         t: (N,) times, s.
-        period: Median spacing of the rows, s.
         tau: (N, J) measured torque, N m; 0 if not logged.
         start: (N,) whether a stretch begins at this row.
         dt: (N,) time since the row before, s.
         evaluated: (N, J) rows that a model has to explain.
-        sent: (M, J) q_des of every command row, rad.
         row: (N,) index of each row in all logs.
         lead: (N,) time by which an instant precedes its row, s.
     """
 
-    def __init__(
-        self,
-        logs: Sequence[Log],
-        steady: float = 0.0,
-    ) -> None:
+    sources: Sources
+    commanded: bool
+    undamped: bool
+    instants_per_row: int
+    period: float
+    log_of_row: Indices
+    t: Array
+    tau: Array
+    start: Bools
+    dt: Array
+    evaluated: Bools
+    row: Indices
+    lead: Array
+    _signals: dict[tuple[Any, ...], Signals] = attrs.field(factory=dict, init=False, repr=False)
+    _states: dict[tuple[Any, ...], dict[str, Array]] = attrs.field(factory=dict, init=False, repr=False)
+    _selections: dict[bytes, Samples] = attrs.field(factory=dict, init=False, repr=False)
+
+    @classmethod
+    def of(
+        cls, logs: Sequence[Log], steady: float = 0.0, options: SearchOptions = SEARCH_DEFAULTS
+    ) -> Samples:
         """Concatenate the rows of logs.
 
         Args:
             logs: Logs with the same joints.
             steady: Half width of the lines that smooth q and dq, s; 0 for none.
-        """
-        self.undamped = all(log.kd is not None and not log.kd.any() for log in logs)
-        known = {name for name in ("kp", "kd") if all(getattr(log, name) is not None for log in logs)}
-        self.commanded = "kp" in known
-        known -= {"kd"} if self.undamped else set()
-        self.logs = [LogSignals(log, steady, known) for log in logs]
-        self.joints = logs[0].joints
-        lengths = [len(log.t) for log in logs]
-        self.log_of_row = np.repeat(np.arange(len(logs)), lengths)
-        self.t = np.concatenate([as_double(log.t) for log in logs])
-        self.period = float(np.median(np.concatenate([np.diff(log.t) for log in logs])))
-        self.tau = np.concatenate([as_double(log.q * 0.0 if log.tau is None else log.tau) for log in logs])
-        starts, steps, settled = zip(*(self._stretches(log) for log in logs), strict=True)
-        self.start: Bools = np.concatenate(starts)
-        self.dt = np.concatenate(steps)
-        self.evaluated: Bools = np.concatenate([log.valid for log in logs]) & np.concatenate(settled)[:, None]
-        self.sent = np.concatenate([one.commands["q_des"] for one in self.logs])
-        self.row = np.arange(len(self.t))
-        self.lead = np.zeros(len(self.t))
-        self._upsampled: Samples | None = None
-        self._selections: dict[bytes, Samples] = {}
-        self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
-        self._first_row = np.cumsum([0, *lengths])
-        self._constant = _constant_signals([one.signals for one in self.logs])
-        self._cache: dict[tuple[Any, ...], Signals] = {}
-        self._states: dict[tuple[Any, ...], dict[str, Array]] = {}
+            options: Options of the search.
 
-    def _stretches(self, log: Log) -> tuple[Bools, Array, Bools]:
-        """For each row: whether a stretch begins, the spacing before, whether the past is known."""
-        # The past of a row is known if SETTLING_S have passed since the last gap and since the first
-        # command.
-        start = log.after_gap
-        start[0] = True
-        steps = np.where(start, log.period, np.diff(log.t, prepend=log.t[0]))
-        began = np.maximum.accumulate(np.where(start, log.t, -np.inf))
-        known = (log.t - began >= SETTLING_S) & (log.t - SETTLING_S >= log.t_cmd[0])
-        return np.asarray(start), np.asarray(steps, dtype=float), np.asarray(known)
+        Returns:
+            The samples of all rows.
+        """
+        undamped = all(log.kd is not None and not log.kd.any() for log in logs)
+        known = {name for name in ("kp", "kd") if all(getattr(log, name) is not None for log in logs)}
+        commanded = "kp" in known
+        known -= {"kd"} if undamped else set()
+        series = [LogSignals(log, steady, known, options.sharp_accelerations) for log in logs]
+        starts, steps, settled = zip(*map(_stretches, logs), strict=True)
+        t = np.concatenate([one.t for one in series])
+        return cls(
+            sources=Sources.of(series),
+            commanded=commanded,
+            undamped=undamped,
+            instants_per_row=options.instants_per_row,
+            period=float(np.median(np.concatenate([np.diff(log.t) for log in logs]))),
+            log_of_row=np.repeat(np.arange(len(logs)), [len(log.t) for log in logs]),
+            t=t,
+            tau=np.concatenate([as_double(log.q * 0.0 if log.tau is None else log.tau) for log in logs]),
+            start=np.concatenate(starts),
+            dt=np.concatenate(steps),
+            evaluated=np.concatenate([log.valid for log in logs]) & np.concatenate(settled)[:, None],
+            row=np.arange(len(t)),
+            lead=np.zeros(len(t)),
+        )
+
+    @property
+    def logs(self) -> tuple[Log, ...]:
+        """The logs, one after the other."""
+        return tuple(one.log for one in self.sources.series)
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return self.sources.series[0].log.joints
+
+    @property
+    def reference_gains(self) -> tuple[float, float]:
+        """Gains that deviations are relative to: medians of kp (N m/rad) and kd (N m s/rad)."""
+        kp, kd = (
+            float(np.median(np.concatenate([one.gains[name].ravel() for one in self.sources.series])))
+            for name in ("kp", "kd")
+        )
+        return max(kp, 1e-6), max(kd, 1e-6)
 
     def drop_heldout(self, rows: Bools) -> Samples:
         """Drop the logs at the end that hold none of the given rows.
@@ -245,11 +329,10 @@ class Samples:
             The remaining samples.
         """
         count = int(self.log_of_row[np.flatnonzero(rows.any(axis=1))[-1]]) + 1 if rows.any() else 1
-        if count == len(self.logs):
+        if count == len(self.sources.series):
             return self
         part = self.take_rows(np.flatnonzero(self.log_of_row < count))
-        part.logs, part.sent = self.logs[:count], self.sent[: self._first_packet[count]]
-        return part
+        return attrs.evolve(part, sources=self.sources.first(count))
 
     def thinned(self, step: int) -> tuple[Samples, Indices]:
         """Keep one of every few rows; the signals between them stay known.
@@ -258,27 +341,28 @@ class Samples:
             step: Spacing, rows.
 
         Returns:
-            The samples, and the indices of their rows.
+            The samples, and the indices of their rows; these samples if all rows are kept.
         """
+        if step == 1:
+            return self, np.arange(len(self.t))
         rows = np.arange(step - 1, len(self.t), step)
-        part = self.take_rows(rows)
-        stretch = np.cumsum(self.start)[rows]
-        part.start = np.diff(stretch, prepend=-1) > 0
-        part.period = step * self.period
-        part.dt = np.where(part.start, part.period, np.diff(part.t, prepend=part.t[0] - part.period))
-        return part, rows
+        t, period = self.t[rows], step * self.period
+        start = np.diff(np.cumsum(self.start)[rows], prepend=-1) > 0
+        dt = np.where(start, period, np.diff(t, prepend=t[0] - period))
+        return attrs.evolve(self.take_rows(rows), start=start, dt=dt, period=period), rows
 
-    @property
+    @cached_property
     def upsampled(self) -> Samples:
-        """The samples with `INSTANTS_PER_ROW` evenly spaced instants for each row."""
-        if self._upsampled is None:
-            part = self.take_rows(np.repeat(np.arange(len(self.t)), INSTANTS_PER_ROW))
-            before = np.tile(np.arange(INSTANTS_PER_ROW)[::-1], len(self.t)) / INSTANTS_PER_ROW
-            part.lead = np.where(part.start, 0.0, before * part.dt)
-            part.dt = part.dt / INSTANTS_PER_ROW
-            part.start = part.start & (np.arange(len(part.t)) % INSTANTS_PER_ROW == 0)
-            self._upsampled = part
-        return self._upsampled
+        """The samples with `instants_per_row` evenly spaced instants for each row."""
+        count = self.instants_per_row
+        part = self.take_rows(np.repeat(np.arange(len(self.t)), count))
+        before = np.tile(np.arange(count)[::-1], len(self.t)) / count
+        return attrs.evolve(
+            part,
+            lead=np.where(part.start, 0.0, before * part.dt),
+            dt=part.dt / count,
+            start=part.start & (np.arange(len(part.t)) % count == 0),
+        )
 
     def select_rows(self, rows: Bools) -> Samples:
         """Keep the rows that a mask marks; the result is cached, since fits reuse the same masks.
@@ -303,11 +387,7 @@ class Samples:
         Returns:
             The samples of these rows.
         """
-        part = copy(self)
-        for name in _ROW_FIELDS:
-            setattr(part, name, getattr(self, name)[rows])
-        part._cache, part._states, part._upsampled, part._selections = {}, {}, None, {}
-        return part
+        return attrs.evolve(self, **{name: getattr(self, name)[rows] for name in _ROW_FIELDS})
 
     def at(self, input_delay: Array | float, output_delay: Array | float, window: float) -> Signals:
         """Compute the signals at given delays.
@@ -326,7 +406,7 @@ class Samples:
         shared = len(set(pairs)) == 1
         key = (window, pairs[0]) if shared else (window, *pairs)
         return self._cached(
-            self._cache,
+            self._signals,
             key,
             lambda: self._make_signals(*pairs[0], window) if shared else self._mix_delays(pairs, window),
         )
@@ -346,7 +426,7 @@ class Samples:
         delays = np.broadcast_to(input_delay + output_delay, self.tau.shape[1:])
         slope = partial(self._slope, 0.0, delays - 0.5 * window, ALL_JOINTS)
         key = ("joint", window, *np.round(delays, 7).tolist())
-        return self._cached(self._cache, key, lambda: attrs.evolve(self.at(0.0, 0.0, window), slope=slope))
+        return self._cached(self._signals, key, lambda: attrs.evolve(self.at(0.0, 0.0, window), slope=slope))
 
     def _cached(
         self, cache: dict[tuple[Any, ...], Made], key: tuple[Any, ...], make: Callable[[], Made]
@@ -386,8 +466,9 @@ class Samples:
 
     def _request_times(self, output_delay: float) -> Iterator[Array]:
         """Yield for each log the instants at which the torque of its rows was requested."""
-        edges = np.searchsorted(self.log_of_row, np.arange(len(self.logs) + 1))
-        for one, first, a, b in zip(self.logs, self._first_row, edges[:-1], edges[1:], strict=False):
+        series, first_row = self.sources.series, self.sources.first_row
+        edges = np.searchsorted(self.log_of_row, np.arange(len(series) + 1))
+        for one, first, a, b in zip(series, first_row, edges[:-1], edges[1:], strict=False):
             yield one.t[self.row[a:b] - first] - self.lead[a:b] - output_delay
 
     def _shifted_state(self, output_delay: Array | float, name: str, late: Array) -> Array:
@@ -398,7 +479,7 @@ class Samples:
         )
         parts = [
             one.state_shifted(name, at, before)
-            for one, at in zip(self.logs, self._request_times(0.0), strict=True)
+            for one, at in zip(self.sources.series, self._request_times(0.0), strict=True)
         ]
         return np.concatenate(parts, axis=-2)
 
@@ -412,13 +493,13 @@ class Samples:
     ) -> Signals:
         """Signals of some joints at one pair of delays; `delays` (J,) are those of accelerations."""
         chosen = ALL_JOINTS if joints is None else joints
-        constant = self._constant
+        series, constant = self.sources.series, self.sources.constant
         parts: dict[str, list[Array]] = {}
         packets, ages = [], []
         if delays is None:
             delays = np.full(self.tau.shape[1], input_delay + output_delay - 0.5 * window)
         for one, at, first in zip(
-            self.logs, self._request_times(output_delay), self._first_packet, strict=False
+            series, self._request_times(output_delay), self.sources.first_packet, strict=False
         ):
             sent = at - input_delay
             row = one.command_rows(sent)
@@ -442,7 +523,7 @@ class Samples:
             packet=np.concatenate(packets),
             age=np.maximum(np.concatenate(ages), 0.0),
             row=self.row[:, None],
-            sent=self.sent,
+            sent=self.sources.sent,
             read_shifted=partial(self._shifted_state, output_delay),
             slope=partial(self._slope, output_delay, delays, chosen),
             **signals,
@@ -453,9 +534,9 @@ class Samples:
 
         def make() -> dict[str, Array]:
             parts: dict[str, list[Array]] = {}
-            for one, at in zip(self.logs, self._request_times(output_delay), strict=False):
+            for one, at in zip(self.sources.series, self._request_times(output_delay), strict=False):
                 found = one.locate(at)
-                for name in one.states.keys() - self._constant:
+                for name in one.states.keys() - self.sources.constant:
                     parts.setdefault(name, []).append(
                         one.state_at(name, at, ALL_JOINTS if joints is None else joints, found)
                     )
@@ -469,6 +550,6 @@ class Samples:
         """An acceleration (N, J) at this output delay; commands move the joints after `delays` (J,)."""
         parts = [
             one.acceleration_at(name, at, delays, joints)
-            for one, at in zip(self.logs, self._request_times(output_delay), strict=False)
+            for one, at in zip(self.sources.series, self._request_times(output_delay), strict=False)
         ]
         return np.concatenate(parts)

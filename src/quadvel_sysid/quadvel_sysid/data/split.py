@@ -11,12 +11,11 @@ import numpy as np
 
 from quadvel_description.arrays import Array, Bools, Indices
 
+from ..options import SEARCH_DEFAULTS
 from .signals import Samples
 
 CLUSTER_DURATION_S = 0.1
 """Duration, s, over which sums of residuals count as independent."""
-CLUSTER_MOTION_RAD = 0.02
-"""Motion, rad, of some joint that ends a cluster: samples at rest are not independent."""
 
 
 @attrs.frozen(eq=False)
@@ -74,20 +73,21 @@ class DataSplit:
         return total
 
 
-def cluster_starts(samples: Samples) -> Indices:
+def cluster_starts(samples: Samples, motion: float = SEARCH_DEFAULTS.cluster_motion_rad) -> Indices:
     """Divide the rows into clusters for the tests.
 
     A cluster begins where a log begins, or when at least `CLUSTER_DURATION_S` has passed and some
-    joint has moved by `CLUSTER_MOTION_RAD`.
+    joint has moved by `motion`: samples at rest are not independent.
 
     Args:
         samples: Rows of all logs.
+        motion: Motion of some joint that ends a cluster, rad.
 
     Returns:
         Row at which each cluster begins, (C,).
     """
     # Intervals of CLUSTER_DURATION_S; merged while the angles of all joints stay within
-    # CLUSTER_MOTION_RAD of those in the first interval of the cluster.
+    # `motion` of those in the first interval of the cluster.
     at = np.floor(samples.t / CLUSTER_DURATION_S).astype(int) + 10**7 * samples.log_of_row
     starts = np.flatnonzero(np.diff(at, prepend=at[0] - 1))
     q = samples.at(0.0, 0.0, 0.0).q
@@ -97,6 +97,6 @@ def cluster_starts(samples: Samples) -> Indices:
     for k in range(1, len(starts)):
         last = kept[-1]
         moved = np.maximum(highest[k] - lowest[last], highest[last] - lowest[k]).max()
-        if log[k] != log[last] or moved > CLUSTER_MOTION_RAD:
+        if log[k] != log[last] or moved > motion:
             kept.append(k)
     return starts[kept]

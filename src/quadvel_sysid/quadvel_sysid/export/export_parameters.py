@@ -13,7 +13,6 @@ from quadvel_actuator.parameters import ActuatorParameters, DelayPair, Effect
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.robot import JOINT_NAMES
 
-from ..data.preparation import reference_gains
 from ..data.split import DataSplit
 from ..model.applied_effect import AppliedEffect
 from ..model.delays import running_delays
@@ -110,7 +109,7 @@ def _peak_torque(model: Model, effect: AppliedEffect, rows: Bools) -> Array:
 
 def _gain_parameters(model: Model) -> tuple[dict[str, Any], list[Effect]]:
     """Reference gains and their deviations; viscous friction for a drive without commanded kd."""
-    joints, (kp, kd) = model.samples.joints, reference_gains(model.samples)
+    joints, (kp, kd) = model.samples.joints, model.samples.reference_gains
     delta_kp, delta_kd = gain_deviations(model)
     own = []
     if model.samples.undamped:
@@ -132,7 +131,7 @@ def gain_deviations(model: Model) -> Array:
         Deviations of kp (N m/rad) and kd (N m s/rad), (2, J); the whole kd where none is commanded.
     """
     commanded = np.array([[1.0], [0.0 if model.samples.undamped else 1.0]])
-    found: Array = (model.gains - commanded) * np.array(reference_gains(model.samples))[:, None]
+    found: Array = (model.gains - commanded) * np.array(model.samples.reference_gains)[:, None]
     return found
 
 
@@ -219,5 +218,5 @@ def effect_settings(effect: AppliedEffect) -> dict[str, Any]:
         name: [v for v, acts in zip(value, effect.active, strict=True) if acts]
         if isinstance(value, list)
         else value
-        for name, value in effect.candidate.settings.items()
+        for name, value in effect.candidate.effect.settings.items()
     }

@@ -1,9 +1,7 @@
 """The record of a measured joint log, independent of the file format it was read from.
 
 `Log` validates what every computation needs: matching shapes, finite numbers, increasing times.
-The checks of a valid log against the robot are in `checks.py`. The readers are in
-`recordings.py` (MCAP, rosbag2, ROS 1) and `tables.py` (all other formats, through `files.py`).
-`read_log.read_log` makes a `Log` from a path.
+`read_log.read_log` makes a `Log` from a path, and `check_log.check_log` checks it against the robot.
 """
 
 from __future__ import annotations
@@ -52,7 +50,7 @@ class Log:
     A state row holds the values measured at its time. A command is in force from its time until
     the next one (zero-order hold). Construction raises `LogError` unless times increase strictly,
     all numbers are finite and all shapes match. Arrays are in double precision, or in single
-    precision if the file holds more than `raw.MAX_DOUBLE_VALUES` values: cast before solving
+    precision if the file holds more than `readers.raw.MAX_DOUBLE_VALUES` values: cast before solving
     linear systems with them.
 
     Attributes:
@@ -138,6 +136,17 @@ class Log:
             Row indices of the same shape; 0 before the first command.
         """
         return np.maximum(np.searchsorted(self.t_cmd, np.asarray(at) + TIME_TOLERANCE_S, side="right") - 1, 0)
+
+    def joints_where(self, hit: Bools) -> tuple[str, ...]:
+        """Return the names of the joints that a mask marks.
+
+        Args:
+            hit: (J,) mask.
+
+        Returns:
+            The names, in the order of the log.
+        """
+        return tuple(name for name, one in zip(self.joints, hit, strict=True) if one)
 
     def without_feed_forward(self) -> Log:
         """Subtract the feed-forward torque from the measured torque.

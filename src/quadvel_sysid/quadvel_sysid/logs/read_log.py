@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from . import lerobot
-from .columns import ColumnMap
 from .log import Log
-from .recordings import Topics, read_recording
-from .tables import read_table
+from .readers import lerobot
+from .readers.columns import ColumnMap
+from .readers.recordings import Topics, read_recording
+from .readers.tables import read_table
 
 
 def read_log(

@@ -13,14 +13,11 @@ from typing import Any, ClassVar, Protocol
 import attrs
 import numpy as np
 
-from quadvel_actuator.effects import JOINT, EffectModel, Parameter, Stage
+from quadvel_actuator.effects import DRIVE, JOINT, EffectModel, Parameter, Stage
 from quadvel_actuator.effects.numerics import distinct_indices
 from quadvel_description.arrays import Array, Bools
 
 from ..data.signals import Samples, Signals
-
-_MEMORY_COST = 0.5
-"""Further cost, in parameters, of an effect with memory or one that resembles a delay."""
 
 InitialGuess = Mapping[str, Any]
 """Guess of every parameter that is not linear: a number, or one per joint (J,)."""
@@ -59,6 +56,9 @@ class EffectCandidate:
         acts_between_rows: Whether it also depends on what happens between the rows of a log.
         all_joints_together: Whether it happens to all joints of a robot at the same time.
         motion: Motion to record in order to distinguish it from other effects.
+        settings_to_try: Settings of the forms to try on a log.
+        places: Where an added torque is tried.
+        guesses: Starting points of the parameters.
     """
 
     effect: EffectModel
@@ -66,6 +66,9 @@ class EffectCandidate:
     acts_between_rows: ClassVar[bool] = False
     all_joints_together: ClassVar[bool] = False
     motion: ClassVar[str] = "richer motion"
+    settings_to_try: ClassVar[Sequence[Mapping[str, str]]] = ({},)
+    places: ClassVar[Sequence[str]] = (DRIVE, JOINT)
+    guesses: ClassVar[Sequence[InitialGuess]] = ({},)
 
     @property
     def depends_on_commands(self) -> bool:
@@ -134,19 +137,9 @@ class EffectCandidate:
         return self.effect.has_memory
 
     @property
-    def settings(self) -> dict[str, Any]:
-        """Settings that are not the default."""
-        return self.effect.settings
-
-    @property
     def key(self) -> tuple[str, ...]:
         """Key by which candidates count as the same."""
         return (self.name,)
-
-    @property
-    def complexity(self) -> float:
-        """Cost in the criterion: equivalent number of parameters per joint."""
-        return len(self.parameters) + (_MEMORY_COST if self.shifts or self.has_memory else 0.0)
 
     @property
     def penalty(self) -> Array | None:
@@ -161,6 +154,17 @@ class EffectCandidate:
         """
         return ()
 
+    def complexity(self, memory_cost: float) -> float:
+        """Return the cost in the criterion.
+
+        Args:
+            memory_cost: Further parameters that an effect with memory, or one like a delay, counts as.
+
+        Returns:
+            Equivalent number of parameters per joint.
+        """
+        return len(self.parameters) + (memory_cost if self.shifts or self.has_memory else 0.0)
+
     @classmethod
     def forms(cls, effect: type[EffectModel], context: FormContext) -> Sequence[EffectCandidate]:
         """List the forms to try on a log.
@@ -172,9 +176,8 @@ class EffectCandidate:
         Returns:
             Forms of the effect; empty where it cannot act.
         """
-        if effect.stage == Stage.ADDED:
-            return cls(effect()), cls(effect(at=JOINT))
-        return (cls(effect()),)
+        places = cls.places if effect.stage == Stage.ADDED else (DRIVE,)
+        return [cls(effect(**settings, at=at)) for settings in cls.settings_to_try for at in places]
 
     def initial_guesses(self, s: Signals, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         """List starting points for a search of the parameters.
@@ -188,7 +191,7 @@ class EffectCandidate:
         Returns:
             Guesses; a parameter that is left out starts from its scale.
         """
-        return [{}]
+        return self.guesses
 
     def special_case(self, p: Mapping[str, Array]) -> tuple[EffectCandidate, Mapping[str, Array]] | None:
         """Return the effect with fewer parameters that this one becomes in a limit.

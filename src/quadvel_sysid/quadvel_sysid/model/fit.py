@@ -17,6 +17,7 @@ from scipy.sparse.linalg import splu
 
 from quadvel_description.arrays import Array, Bools
 
+from ..options import SEARCH_DEFAULTS, SearchOptions
 from ..parallel import parallel_map
 from .jacobian import Unknowns, jacobian, pack, with_slots
 from .torque_model import MAX_DELAYS_S, Model
@@ -73,19 +74,20 @@ _OUTPUT_DELAY_CHANGES_S = np.array([-0.002, -0.001, 0.0, 0.001, 0.002])
 """Grid of delays, s: changes of their sum, and of the output delay."""
 _FAR_DELAY_CHANGES_S = np.array([-0.008, -0.007, -0.006, -0.005, -0.004, 0.004, 0.005, 0.006, 0.007, 0.008])
 """Further changes of the sum alone, s: a missing effect may have biased the delays by so much."""
-_DELAY_STARTS = 3
-"""Grid points from which fits start."""
 _NEAR_DELAY_CHANGES_S = (-0.002, -0.001, 0.001, 0.002)
 """Coarse grid of changes of the sum of delays, s."""
 
 
-def fit_delay_profile(model: Model, rows: Bools, cores: int = 1) -> Model:
+def fit_delay_profile(
+    model: Model, rows: Bools, cores: int = 1, options: SearchOptions = SEARCH_DEFAULTS
+) -> Model:
     """Fit a model from the best points of a grid of delays (profile likelihood).
 
     Args:
         model: A fitted model.
         rows: Samples to fit, (N, J) bool.
         cores: Worker processes.
+        options: Options of the search.
 
     Returns:
         The model with the least squared error, among `model` and the fits.
@@ -96,9 +98,9 @@ def fit_delay_profile(model: Model, rows: Bools, cores: int = 1) -> Model:
     samples, (model, rows) = model.samples, _fitted_rows_only(model, rows)
     shifts = (
         *product(_TOTAL_DELAY_CHANGES_S, _OUTPUT_DELAY_CHANGES_S),
-        *product(_FAR_DELAY_CHANGES_S, (0.0,)),
+        *product(_FAR_DELAY_CHANGES_S if options.far_delays else (), (0.0,)),
     )
-    starts = [model, *_one_step_at_each_delay(model, rows, shifts, cores)[:_DELAY_STARTS]]
+    starts = [model, *_one_step_at_each_delay(model, rows, shifts, cores)[: options.delay_starts]]
     fits = parallel_map(lambda k: fit(starts[k], rows), len(starts), cores, model.samples)
     return attrs.evolve(min([model, *fits], key=lambda one: squared_error(one, rows)), samples=samples)
 

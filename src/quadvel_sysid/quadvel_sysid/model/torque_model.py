@@ -21,7 +21,7 @@ import numpy as np
 from quadvel_actuator.effects import DRIVE, Stage
 from quadvel_description.arrays import Array, Bools, Indices
 
-from ..data.signals import INSTANTS_PER_ROW, Samples, Signals
+from ..data.signals import Samples, Signals
 from .applied_effect import AppliedEffect
 from .effect_candidate import EffectCandidate
 
@@ -109,7 +109,8 @@ class Model:
         """
         if self.window == 0.0 and any(effect.candidate.acts_between_rows for effect in self.effects):
             upsampled = attrs.evolve(self, samples=self.samples.upsampled)
-            return upsampled._evaluate(gains, values)[..., INSTANTS_PER_ROW - 1 :: INSTANTS_PER_ROW, :]
+            instants = self.samples.instants_per_row
+            return upsampled._evaluate(gains, values)[..., instants - 1 :: instants, :]
         return self._evaluate(gains, values)
 
     def _evaluate(self, gains: Array, values: Sequence[Array]) -> Array:

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from quadvel_description.arrays import Array
 
 from .identification import Shape, Trace
+from .rendering import html_figure, short_joint_name
 
 MEASURED, PD, BEFORE, AFTER = "#7d8590", "#b58900", "#d9622b", "#1a8fc4"
 """Colours of the models, readable on white and on black."""
@@ -65,19 +66,7 @@ def svg_figure(width: float, height: float, draw: Callable[[Figure], None]) -> s
     prefix = f"f{zlib.crc32(svg.encode()):08x}-"  # several figures share one page
     svg = re.sub(r'\bid="', f'id="{prefix}', svg)
     svg = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{prefix}", svg)
-    return f'<div class="figure" style="max-width:{width:g}in">{svg}</div>'
-
-
-def short_joint_name(joint: str) -> str:
-    """Shorten the name of a joint: `FR_calf` for `FR_calf_joint`.
-
-    Args:
-        joint: Full name.
-
-    Returns:
-        Name without `_joint`.
-    """
-    return joint.removesuffix("_joint")
+    return html_figure(svg, width)
 
 
 def torque_figure(trace: Trace) -> str:

@@ -14,7 +14,7 @@ from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description.arrays import Array
 
 
-@attrs.frozen(eq=False)
+@attrs.frozen(eq=False, kw_only=True)
 class Trace:
     """Held-out torque series of one joint, (n,) each.
 
@@ -33,7 +33,7 @@ class Trace:
     after: Array
 
 
-@attrs.frozen(eq=False)
+@attrs.frozen(eq=False, kw_only=True)
 class Shape:
     """Residual of one joint over the signal that explains it.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import attrs
@@ -12,7 +13,8 @@ from quadvel_actuator.effects.basis_regressors import LEARNED_RESIDUAL
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description.arrays import Array
 
-from ..data.preparation import reference_gains
+from ..data.plain_model import pd_torque
+from ..data.signals import Samples
 from ..data.split import DataSplit
 from ..export.export_parameters import (
     acting_joints,
@@ -49,14 +51,7 @@ _TORQUE_LIMIT_MARGIN = 1.1
 
 _MAX_POINTS = 4000
 """Maximum number of points of a series in a figure."""
-_SIGNAL_UNITS = {
-    "q": "rad",
-    "q_des": "rad",
-    "dq": "rad/s",
-    "ddq": "rad/s^2",
-    "tau": "N m",
-    "t": "s",
-}
+_SIGNAL_UNITS = {"q": "rad", "q_des": "rad", "dq": "rad/s", "ddq": "rad/s^2", "tau": "N m", "t": "s"}
 
 
 @attrs.frozen(eq=False)
@@ -75,52 +70,80 @@ class SelectedEffect:
 
 
 @attrs.frozen(eq=False)
+class Evidence:
+    """Evidence for and against effects.
+
+    Attributes:
+        effects: Evidence for each effect of the corrected model, in the same order.
+        rejected: Rejected effects: name, gain on the selection rows (N^2 m^2), reason.
+        is_white: Whether the residual is indistinguishable from white noise.
+        correlates: Signals that a structured residual correlates with, if no regressor does.
+    """
+
+    effects: tuple[SelectedEffect, ...]
+    rejected: tuple[tuple[str, float, str], ...]
+    is_white: bool
+    correlates: tuple[str, ...]
+
+
+@attrs.frozen(eq=False)
+class Refit:
+    """A model, refitted.
+
+    Attributes:
+        model: Fitted to the fitted and selection rows.
+        all_rows: Fitted to every row.
+    """
+
+    model: Model
+    all_rows: Model
+
+
+@attrs.frozen(eq=False, kw_only=True)
 class Outcome:
     """Results of all steps of an identification.
 
-    Models `*_all_rows` are fitted to every row, the others to the fitted and selection rows.
-
     Attributes:
         before: Plain EAM.
-        before_all_rows: Plain EAM, fitted to every row.
-        model: Corrected model.
-        model_all_rows: Corrected model, fitted to every row.
-        effects: Evidence for each effect of `model`, in the same order.
-        rejected: Rejected effects: name, gain on the selection rows (N^2 m^2), reason.
-        is_white: Whether the residual is indistinguishable from white noise.
-        residual_correlates: Signals that a structured residual correlates with, if no term does.
-        half_widths: 95 % confidence intervals of `model_all_rows`.
-        ideal_torque: Torque of the commanded PD law without delays, (N, J), N m.
+        after: Corrected model.
+        evidence: Evidence for and against effects.
+        half_widths: 95 % confidence intervals of `after.all_rows`.
         noise: Variance of the torque noise, (J,), N^2 m^2.
         parts: Data split.
         base: Parameters that the corrected model extends.
     """
 
-    before: Model
-    before_all_rows: Model
-    model: Model
-    model_all_rows: Model
-    effects: tuple[SelectedEffect, ...]
-    rejected: tuple[tuple[str, float, str], ...]
-    is_white: bool
-    residual_correlates: tuple[str, ...]
+    before: Refit
+    after: Refit
+    evidence: Evidence
     half_widths: Intervals
-    ideal_torque: Array
     noise: Array
     parts: DataSplit
     base: ActuatorParameters
 
     @property
+    def samples(self) -> Samples:
+        """Rows of all logs."""
+        return self.after.model.samples
+
+    @cached_property
+    def ideal_torque(self) -> Array:
+        """Torque of the commanded PD law without delays, (N, J), N m."""
+        commanded = np.ones_like(self.after.model.gains)
+        commanded[1] = 0.0 if self.samples.undamped else 1.0
+        return pd_torque(self.samples, commanded, 0.0, 0.0, 0.0)
+
+    @property
     def predicted(self) -> Array:
         """Torque that the corrected model predicts, (N, J), N m."""
-        return self.model.predictive().predict()
+        return self.after.model.predictive().predict()
 
     @property
     def regressors(self) -> list[tuple[int, AppliedEffect, RegressorCandidate]]:
         """Regressors of named signals: index among the effects, effect, and its form."""
         return [
             (k, effect, effect.candidate)
-            for k, effect in enumerate(self.model.effects)
+            for k, effect in enumerate(self.after.model.effects)
             if isinstance(effect.candidate, RegressorCandidate)
         ]
 
@@ -138,17 +161,21 @@ def build_identification(outcome: Outcome, findings: Sequence[tuple[str, LogFind
     report = _report(outcome)
     report["findings"] = [{"log": name, **attrs.asdict(one)} for name, one in findings]
     corrected = actuator_parameters(
-        outcome.model_all_rows, outcome.parts, outcome.base, outcome.half_widths.effects
+        outcome.after.all_rows, outcome.parts, outcome.base, outcome.half_widths.effects
     )
     return Identification(report, corrected, _traces(outcome), _shapes(outcome))
 
 
 def _report(o: Outcome) -> dict[str, Any]:
     """The dict of report.json, without findings, baselines and replays."""
-    samples, parts = o.model.samples, o.parts
+    samples, parts = o.samples, o.parts
     errors = {
         name: samples.tau - torque
-        for name, torque in (("pd", o.ideal_torque), ("before", o.before.predict()), ("after", o.predicted))
+        for name, torque in (
+            ("pd", o.ideal_torque),
+            ("before", o.before.model.predict()),
+            ("after", o.predicted),
+        )
     }
     mses: dict[str, dict[str, Any]] = {
         name: {
@@ -176,21 +203,23 @@ def _report(o: Outcome) -> dict[str, Any]:
         | {
             **{
                 name: float(each[0])
-                for name, each in zip(_DELTAS, gain_deviations(o.before_all_rows), strict=True)
+                for name, each in zip(_DELTAS, gain_deviations(o.before.all_rows), strict=True)
             },
-            "input_delay_ms": 1e3 * float(o.before_all_rows.delays[0, 0]),
-            "output_delay_ms": 1e3 * float(o.before_all_rows.delays[1, 0]),
+            "input_delay_ms": 1e3 * float(o.before.all_rows.delays[0, 0]),
+            "output_delay_ms": 1e3 * float(o.before.all_rows.delays[1, 0]),
         },
         "after": mses["after"] | _gain_entries(o),
         "effects": sorted(_effect_entries(o), key=lambda one: -one["heldout_gain"]),
-        "rejected": [{"name": name, "selecting_gain": gain, "reason": why} for name, gain, why in o.rejected],
+        "rejected": [
+            {"name": name, "selecting_gain": gain, "reason": why} for name, gain, why in o.evidence.rejected
+        ],
         "unexplained": _unexplained(o, mses["before"]["heldout_mse"], mses["after"]["heldout_mse"], floor),
         "warnings": [
             f"{name} is at its bound: its value and interval are not valid" for name in o.half_widths.at_bound
         ]
         + _unconfirmed_warnings(o)
-        + _delay_spread_warnings(o.model_all_rows)
-        + _negative_gain_warnings(o.model_all_rows)
+        + _delay_spread_warnings(o.after.all_rows)
+        + _negative_gain_warnings(o.after.all_rows)
         + _torque_limit_warnings(o),
     }
     report["decision"] = summary_text(report)
@@ -199,8 +228,8 @@ def _report(o: Outcome) -> dict[str, Any]:
 
 def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[str, Any]:
     """Section on the residual: regressors of signals, or structure that no effect explains."""
-    parts, samples = o.parts, o.model.samples
-    residual = samples.tau - o.model.predict()
+    parts, samples = o.parts, o.samples
+    residual = samples.tau - o.after.model.predict()
     p = np.minimum(
         whiteness_p_values(residual, parts.all_rows, samples.start, parts.noise_overlap),
         normality_p_values(residual, parts.all_rows),
@@ -213,13 +242,13 @@ def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[
         else np.zeros(len(coloured), bool)
     )
     removable = before - floor
-    structured = bool(names) or not o.is_white
+    structured = bool(names) or not o.evidence.is_white
     return {
         "verdict": "structured" if structured else "white",
         "fraction": float(np.clip((after - floor) / removable, 0.0, 1.0))
         if removable > _MIN_REMOVABLE * floor
         else 0.0,
-        "depends_on": list(dict.fromkeys(names or o.residual_correlates)),
+        "depends_on": list(dict.fromkeys(names or o.evidence.correlates)),
         "joints": np.array(samples.joints)[joints | (coloured & structured)].tolist(),
     }
 
@@ -228,7 +257,7 @@ def _unconfirmed_warnings(o: Outcome) -> list[str]:
     """Warnings about effects that are not significant on the reported rows."""
     return [
         f"{effect.candidate.name} is not confirmed by the reported rows (p = {evidence.p_value:.2g} there)"
-        for effect, evidence in zip(o.model.effects, o.effects, strict=True)
+        for effect, evidence in zip(o.after.model.effects, o.evidence.effects, strict=True)
         if evidence.p_value > SIGNIFICANCE_LEVEL
     ]
 
@@ -257,7 +286,7 @@ def _negative_gain_warnings(model: Model) -> list[str]:
 
 def _torque_limit_warnings(o: Outcome) -> list[str]:
     """Warnings about measured torques that the corrected model cannot produce."""
-    joints, peak = o.model.samples.joints, np.abs(o.model.samples.tau).max(axis=0)
+    joints, peak = o.samples.joints, np.abs(o.samples.tau).max(axis=0)
     allowed = np.broadcast_to(torque_limits(o.base, joints), peak.shape)
     return [
         f"{joint}: the measured torque reaches {torque:.1f} N m, but torque_limit in actuator.yaml, from the base, is "
@@ -269,9 +298,9 @@ def _torque_limit_warnings(o: Outcome) -> list[str]:
 
 def _gain_entries(o: Outcome) -> dict[str, Any]:
     """Gain deviations and delays with intervals: a number if joints share it, else a list."""
-    model, widths = o.model_all_rows, o.half_widths
+    model, widths = o.after.all_rows, o.half_widths
     found: dict[str, Any] = {}
-    halves = widths.gains * np.array(reference_gains(model.samples))[:, None]
+    halves = widths.gains * np.array(model.samples.reference_gains)[:, None]
     rows = {
         **dict(zip(_DELTAS, zip(gain_deviations(model), halves, strict=True), strict=True)),
         "input_delay_ms": (1e3 * model.delays[0], 1e3 * widths.delays[0]),
@@ -286,11 +315,11 @@ def _gain_entries(o: Outcome) -> dict[str, Any]:
 
 def _effect_entries(o: Outcome) -> list[dict[str, Any]]:
     """Entries of the report for all effects; the regressors of named signals share one."""
-    joints = o.model.samples.joints
+    joints = o.samples.joints
     found = [
         _effect_entry(evidence, effect, half, joints)
         for evidence, effect, half in zip(
-            o.effects, o.model_all_rows.effects, o.half_widths.effects, strict=True
+            o.evidence.effects, o.after.all_rows.effects, o.half_widths.effects, strict=True
         )
         if not isinstance(effect.candidate, RegressorCandidate)
     ]
@@ -301,15 +330,15 @@ def _effect_entries(o: Outcome) -> list[dict[str, Any]]:
 
 def _regressors_entry(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
     """Entry of the report for all regressors of named signals."""
-    ranked = sorted(o.regressors, key=lambda one: -o.effects[one[0]].gain)
+    ranked = sorted(o.regressors, key=lambda one: -o.evidence.effects[one[0]].gain)
     acts = np.any([effect.active for _, effect, _ in ranked], axis=0)
     return {
         "name": LEARNED_RESIDUAL,
         "joints": acting_joints(acts, joints),
         "params": {},
         "indistinguishable": [],
-        "heldout_gain": sum(o.effects[k].gain for k, _, _ in ranked),
-        "p_value": min(o.effects[k].p_value for k, _, _ in ranked),
+        "heldout_gain": sum(o.evidence.effects[k].gain for k, _, _ in ranked),
+        "p_value": min(o.evidence.effects[k].p_value for k, _, _ in ranked),
         "inputs": list(dict.fromkeys(name for _, _, one in ranked for name in one.input_signals)),
         "terms": [
             {
@@ -317,7 +346,7 @@ def _regressors_entry(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
                 "inputs": list(one.input_signals),
                 "at": one.at,
                 "joints": acting_joints(effect.active, joints),
-                "heldout_gain": o.effects[k].gain,
+                "heldout_gain": o.evidence.effects[k].gain,
             }
             for k, effect, one in ranked
         ],
@@ -347,35 +376,50 @@ def _effect_entry(
 
 def _traces(o: Outcome) -> dict[str, Trace]:
     """Held-out torque series of each joint."""
-    samples, reported = o.model.samples, o.parts.report
-    series = (samples.tau, o.ideal_torque, o.before.predict(), o.predicted)
+    samples, reported = o.samples, o.parts.report
+    series = {
+        "measured": samples.tau,
+        "pd": o.ideal_torque,
+        "before": o.before.model.predict(),
+        "after": o.predicted,
+    }
     rows = np.flatnonzero(reported.any(axis=1))[:_MAX_POINTS]
     return {
-        joint: Trace(samples.t[rows], *(np.where(reported[rows, j], x[rows, j], np.nan) for x in series))
+        joint: Trace(
+            t=samples.t[rows],
+            **{name: np.where(reported[rows, j], x[rows, j], np.nan) for name, x in series.items()},
+        )
         for j, joint in enumerate(samples.joints)
     }
 
 
 def _shapes(o: Outcome) -> tuple[Shape, ...]:
     """Residual over the signal that explains it, for up to three joints of each effect."""
-    samples = o.model.samples
-    before, after = samples.tau - o.before.predict(), samples.tau - o.predicted
+    samples = o.samples
+    before, after = samples.tau - o.before.model.predict(), samples.tau - o.predicted
     rows = np.flatnonzero(o.parts.report.any(axis=1))
     rows = rows[:: max(1, len(rows) // _MAX_POINTS)]
     found = []
-    for effect in o.model.effects:
+    for effect in o.after.model.effects:
         for j in np.flatnonzero(effect.active)[:3]:
             x, unit = _signal_series(o, effect.candidate.signal, int(j))
-            x, e0, e1 = x[rows], before[rows, j], after[rows, j]
             found.append(
-                Shape(effect.candidate.name, samples.joints[j], effect.candidate.signal, unit, x, e0, e1)
+                Shape(
+                    effect=effect.candidate.name,
+                    joint=samples.joints[j],
+                    signal=effect.candidate.signal,
+                    unit=unit,
+                    x=x[rows],
+                    before=before[rows, j],
+                    after=after[rows, j],
+                )
             )
     return tuple(found)
 
 
 def _signal_series(o: Outcome, name: str, joint: int) -> tuple[Array, str]:
     """A signal of one joint by its name in the report, and its unit."""
-    s, samples = o.model.signals, o.model.samples
+    s, samples = o.after.model.signals, o.samples
     owner, _, plain = name.rpartition("/")
     j = samples.joints.index(owner) if owner else joint
     kind = plain.partition("@")[0]

@@ -80,3 +80,25 @@ def _heldout_only_text(report: Mapping[str, Any]) -> str:
         f" The held-out error is {after:.3g} N^2 m^2, the error of the fitted data {fitted:.3g}: the held-out data contain an "
         "effect that the fitted data hardly show. Add logs that show it to the fitted ones."
     )
+
+
+def motion_summary(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Build the entries of a report that differ where the torque was inferred from the motion.
+
+    Args:
+        report: Content of report.json with the section `motion`.
+
+    Returns:
+        The entries `before`, `after` and `decision`.
+    """
+    motion = report["motion"]
+    before, after = motion["before"], motion["after"]
+    decision = (
+        f"From motion alone. {report['decision']} In replays over {1e3 * motion['replayed_s']:.0f} ms the error of q changes "
+        f"from {before['q_rms_rad']:.3g} to {after['q_rms_rad']:.3g} rad."
+    )
+    return {
+        "before": report["before"] | {f"heldout_{name}": value for name, value in before.items()},
+        "after": report["after"] | {f"heldout_{name}": value for name, value in after.items()},
+        "decision": decision,
+    }

@@ -22,10 +22,6 @@ from .fitted_model import FittedModel
 from .regressors import RegressorCandidate
 from .screening import CandidateScreening, ScreenedCandidate, promising
 
-MAX_FITTED_EFFECTS, MAX_FITTED_REGRESSORS = 6, 4
-"""Effects, and regressors of named signals, that are fitted after a screening."""
-MAX_SHARED_TRIALS = 3
-"""Best candidates for which sharing across joints is tried."""
 EFFECTS, REGRESSORS = "effects", "regressors"
 Candidate = TypeVar("Candidate", bound=EffectCandidate)
 Result = TypeVar("Result")
@@ -55,8 +51,9 @@ class Candidates:
             before: Model to extend.
             only: Keys of the candidates to consider; all if None.
         """
-        self._before, self._evaluator, self._only = before, before.evaluator, only
-        self._context = Context(before.model, before.evaluator.parts, before.evaluator.noise)
+        evaluator = before.evaluator
+        self._before, self._evaluator, self._only, self._options = before, evaluator, only, evaluator.options
+        self._context = Context(before.model, evaluator.parts, evaluator.noise, evaluator.options)
 
     def _filtered(self, candidates: Iterable[Candidate]) -> Iterator[Candidate]:
         """The candidates to consider."""
@@ -89,23 +86,26 @@ class Candidates:
             if several or not one.confounded_with_gain
         )
         count = len({one.candidate.name for one in found}) or 1
-        return Fitted(self._fit_screened(_first_distinct(promising(found), MAX_FITTED_EFFECTS)), count)
+        best = _first_distinct(promising(found), self._options.fitted_effects)
+        return Fitted(self._fit_screened(best), count)
 
     @cached_property
     def _regressors(self) -> Fitted:
         """The best regressors, refined and fitted."""
         every = list(self._filtered(regressor_library.regressor_candidates(self._context)))
         found = self._screening.screen_regressors(every)
-        best = _first_distinct(promising(found), MAX_FITTED_REGRESSORS)
-        finer = self._parallel_map(lambda k: _refine(best[k], self._screening), len(best))
-        best += [one for one in finer if one not in best]
+        best = _first_distinct(promising(found), self._options.fitted_regressors)
+        if self._options.finer_regressors:
+            finer = self._parallel_map(lambda k: _refine(best[k], self._screening), len(best))
+            best += [one for one in finer if one not in best]
         return Fitted(self._fit_screened(best), len({one.key for one in every}))
 
     def _fit_screened(self, chosen: Sequence[ScreenedCandidate]) -> list[FittedModel]:
         """Fit the candidates, and share the values of the best ones across joints."""
         fitted = self._fit_parallel(lambda k: self._fit_candidate(chosen[k]), len(chosen))
         fitted.sort(key=lambda one: one.criterion)
-        best, others = fitted[:MAX_SHARED_TRIALS], fitted[MAX_SHARED_TRIALS:]
+        tried = self._options.shared_trials
+        best, others = fitted[:tried], fitted[tried:]
         last = len(self._context.model.effects)
         return (
             self._fit_parallel(
@@ -117,7 +117,8 @@ class Candidates:
 
     def _refit_near_delays(self, fitted: FittedModel) -> FittedModel:
         """Refit a regressor from nearby delays if that is better; its screening used one pair."""
-        if not isinstance(fitted.last_effect.candidate, RegressorCandidate):
+        is_regressor = isinstance(fitted.last_effect.candidate, RegressorCandidate)
+        if not (is_regressor and self._options.regressors_at_nearby_delays):
             return fitted
         other = FittedModel(fit_near_delays(fitted.model, self._evaluator.parts.fit), self._evaluator)
         return min(fitted, other, key=lambda one: one.criterion)
@@ -132,7 +133,9 @@ class Candidates:
     def _fit_candidate(self, screened: ScreenedCandidate) -> Model:
         """Fit a candidate on all joints, and on those where it is significant if that is better."""
         evaluator, model, candidate = self._evaluator, screened.model, screened.candidate
-        near = model.with_delays(self._before.model.delays)
+        near, last = model.with_delays(self._before.model.delays), len(model.effects) - 1
+        if not self._options.second_starts:
+            return evaluator.restrict_joints(evaluator.fit(model), last).model
         if candidate.confounded_with_gain:
             # A value that all joints share is a change of a gain or a delay. One joint without the
             # effect makes the fit unique.
@@ -140,7 +143,7 @@ class Candidates:
             model, near = (_drop_weakest_joint(fit(start, rows, 4, delays=False)) for start in (model, near))
         starts = [model, near] if candidate.shifts or candidate.confounded_with_gain else [model]
         fitted = min((evaluator.fit(start) for start in starts), key=lambda one: one.criterion)
-        return evaluator.restrict_joints(fitted, len(fitted.model.effects) - 1).model
+        return evaluator.restrict_joints(fitted, last).model
 
 
 def _refine(screened: ScreenedCandidate, screening: CandidateScreening) -> ScreenedCandidate:

@@ -10,6 +10,7 @@ from quadvel_description.arrays import Array
 
 from ..data.split import DataSplit
 from ..model.torque_model import Model
+from ..options import SEARCH_DEFAULTS, SearchOptions
 from .lost_commands import lost_commands
 
 
@@ -20,21 +21,25 @@ class Context:
         model: Model that an effect would extend.
         parts: Data split.
         noise: Variance of the torque noise, (J,), N^2 m^2.
+        options: Options of the search.
         samples: Rows of all logs.
         signals: Signals at the delays of the model.
         torque: Predicted torque, (N, J), N m.
         residual: Measured minus predicted torque on the fitted rows, 0 elsewhere, (N, J), N m.
     """
 
-    def __init__(self, model: Model, parts: DataSplit, noise: Array) -> None:
+    def __init__(
+        self, model: Model, parts: DataSplit, noise: Array, options: SearchOptions = SEARCH_DEFAULTS
+    ) -> None:
         """Evaluate the model.
 
         Args:
             model: Model that an effect would extend.
             parts: Data split.
             noise: Variance of the torque noise, (J,), N^2 m^2.
+            options: Options of the search.
         """
-        self.model, self.parts, self.noise = model, parts, noise
+        self.model, self.parts, self.noise, self.options = model, parts, noise, options
         self.samples, self.signals = model.samples, model.signals
         self.torque = model.predict()
         self.residual = np.where(parts.fit, self.samples.tau - self.torque, 0.0)
@@ -42,7 +47,7 @@ class Context:
     @cached_property
     def lost_commands(self) -> list[tuple[Array, Array]]:
         """Odds that commands were lost, from `lost_commands.lost_commands`."""
-        return lost_commands(self.model, self.parts, self.noise)
+        return lost_commands(self.model, self.parts, self.noise, self.options.lost_commands_at_random)
 
     def strongest_neighbours(self) -> tuple[str, ...]:
         """Find for each joint the signal of another joint that its residual correlates with most.

@@ -14,6 +14,7 @@ from ..data.split import DataSplit
 from ..model.applied_effect import AppliedEffect
 from ..model.fit import fit, fit_delay_profile
 from ..model.torque_model import Model
+from ..options import SEARCH_DEFAULTS, SearchOptions
 from ..parallel import parallel_map
 from ..statistics.criterion import (
     PENALTY_PER_PARAMETER,
@@ -63,7 +64,7 @@ class FittedModel:
         """
         return float(
             np.log((self.selection_mse + _VARIANCE_FLOOR) / (self.evaluator.noise + _VARIANCE_FLOOR)).sum()
-        ) + PENALTY_PER_PARAMETER * parameter_count(self.model)
+        ) + PENALTY_PER_PARAMETER * parameter_count(self.model, self.evaluator.options.memory_cost)
 
     def compare_with(self, before: FittedModel) -> Comparison:
         """Compare with another fitted model on the selection rows.
@@ -83,7 +84,8 @@ class FittedModel:
         """Whether the residual on the fitted and selection rows passes as white noise."""
         parts, samples = self.evaluator.parts, self.model.samples
         p = whiteness_p_values(self.residual, parts.fit_or_select, samples.start, parts.noise_overlap)
-        p = np.minimum(p, normality_p_values(self.residual, parts.fit_or_select))
+        if self.evaluator.options.kurtosis_test:
+            p = np.minimum(p, normality_p_values(self.residual, parts.fit_or_select))
         return bool((p * 2 * len(p) > WHITENESS_LEVEL).all())
 
     @property
@@ -92,18 +94,19 @@ class FittedModel:
         return self.model.effects[-1]
 
 
-def parameter_count(model: Model) -> float:
+def parameter_count(model: Model, memory_cost: float) -> float:
     """Count the parameters of a model beyond those of the plain EAM.
 
     Args:
         model: The model.
+        memory_cost: Further parameters that an effect with memory, or one like a delay, counts as.
 
     Returns:
         Number of parameters; values shared by joints count once, see `EffectCandidate.complexity`.
     """
     total = 2.0 * (len(np.unique(model.gain_groups)) + len(np.unique(model.delay_groups)) - 2)
     for effect in model.effects:
-        total += effect.candidate.complexity * len(np.unique(effect.groups[effect.active]))
+        total += effect.candidate.complexity(memory_cost) * len(np.unique(effect.groups[effect.active]))
     return total
 
 
@@ -115,11 +118,13 @@ class ModelEvaluator:
         parts: Data split.
         noise: Variance of the torque noise, (J,), N^2 m^2.
         cores: Worker processes.
+        options: Options of the search.
     """
 
     parts: DataSplit
     noise: Array
     cores: int = 1
+    options: SearchOptions = SEARCH_DEFAULTS
 
     def fit(self, model: Model) -> FittedModel:
         """Fit a model to the fitted rows.
@@ -159,7 +164,7 @@ class ModelEvaluator:
         """
         return min(
             fitted,
-            FittedModel(fit_delay_profile(fitted.model, self.parts.fit, self.cores), self),
+            FittedModel(fit_delay_profile(fitted.model, self.parts.fit, self.cores, self.options), self),
             key=lambda one: one.criterion,
         )
 
@@ -178,7 +183,7 @@ class ModelEvaluator:
             return fitted
         without = FittedModel(fitted.model.without_effect(index), self)
         comparison = fitted.compare_with(without)
-        cost = PENALTY_PER_PARAMETER * effect.candidate.complexity
+        cost = PENALTY_PER_PARAMETER * effect.candidate.complexity(self.options.memory_cost)
         needed = (
             effect.active
             & (comparison.joint_p_values < SIGNIFICANCE_LEVEL)

@@ -114,7 +114,9 @@ def _share(part: float, whole: float) -> float:
     return float(np.clip(part / (whole + 1e-12), _MIN_PROBABILITY, 1.0 - _MIN_PROBABILITY))
 
 
-def lost_commands(model: Model, parts: DataSplit, noise: Array) -> list[tuple[Array, Array]]:
+def lost_commands(
+    model: Model, parts: DataSplit, noise: Array, at_random: bool = True
+) -> list[tuple[Array, Array]]:
     """Estimate the backlog of the drive in each row.
 
     The probabilities of a joint do not use its own torque in rows that are used for selection or
@@ -124,6 +126,7 @@ def lost_commands(model: Model, parts: DataSplit, noise: Array) -> list[tuple[Ar
         model: The fitted model.
         parts: Which rows are fitted, used for selection, or held out.
         noise: (J,) variance of the torque's noise, N^2 m^2.
+        at_random: Whether only losses count that the age of a command does not predict.
 
     Returns:
         A list with one pair: probabilities of a backlog of 0 to `MAX_BACKLOG` commands in each
@@ -135,7 +138,9 @@ def lost_commands(model: Model, parts: DataSplit, noise: Array) -> list[tuple[Ar
         return []
     odds = backlog_probabilities(model, noise, MAX_BACKLOG, ~parts.fit)
     usual = odds[parts.fit].mean(axis=0)
-    if 1.0 - usual[0] < _MIN_LOST_SHARE or not _at_random(model, odds, usual, parts):
+    if 1.0 - usual[0] < _MIN_LOST_SHARE:
+        return []
+    if at_random and not _at_random(model, odds, usual, parts):
         return []
     return [(_expand_rows(odds, model.samples.row), usual)]
 

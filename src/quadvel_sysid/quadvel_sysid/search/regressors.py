@@ -215,9 +215,8 @@ class RegressorCandidate(EffectCandidate):
     def depends_on_commands(self) -> bool:
         return self.effect.reads_torque or self.effect.reads_acceleration or self.effect.of in DRIVE_SIGNALS
 
-    @property
     @override
-    def complexity(self) -> float:
+    def complexity(self, memory_cost: float) -> float:
         return _SIGNAL_COST * len(self.input_signals)
 
     @property

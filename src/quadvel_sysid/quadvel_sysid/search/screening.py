@@ -31,6 +31,8 @@ _TOTAL_DELAY_CHANGES_S = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004, 0.006, 0.00
 _NO_DELAY_CHANGES_S = (0.0,)
 _OUTPUT_DELAYS_S = (0.0005, 0.0025, 0.0045)
 """Grid of delays, s: changes of their sum, and output delays."""
+_ONE_GRID_POINT = (0.0,), (0.0025,)
+"""The same, if only one other pair of delays is tried."""
 _MAX_DELAY_CHANGE_S = 0.0015
 """Range, s, of the linearisation along the delays around a grid point."""
 _ROWS_PER_JOINT = 1500
@@ -111,7 +113,8 @@ class CandidateScreening:
         self._context, self._cores, self._rows = context, cores, ScreeningRows.of(context)
         self._has_memory = any(one.candidate.has_memory for one in context.model.effects)
         shifts = _NO_DELAY_CHANGES_S if self._has_memory else _TOTAL_DELAY_CHANGES_S
-        self._grid = [context.model, *_delay_grid(context.model, shifts)]
+        grid = (shifts, _OUTPUT_DELAYS_S) if context.options.screening_grid else _ONE_GRID_POINT
+        self._grid = [context.model, *_delay_grid(context.model, *grid)]
 
     def screen_effects(self, candidates: Iterable[EffectCandidate]) -> list[ScreenedCandidate]:
         """Score effects at every point of the grid of delays.
@@ -200,7 +203,8 @@ class CandidateScreening:
         reduction = np.maximum(self.baseline_sse - error, 0.0) * allowed
         ratio = 1.0 - reduction / np.maximum(self.baseline_sse, 1e-300)
         gain = -np.log(np.maximum(ratio, _MIN_ERROR_RATIO))
-        score = float(np.sum(np.maximum(gain - PENALTY_PER_PARAMETER * one.complexity, 0.0)))
+        cost = PENALTY_PER_PARAMETER * one.complexity(self._context.options.memory_cost)
+        score = float(np.sum(np.maximum(gain - cost, 0.0)))
         return ScreenedCandidate(model, score)
 
     def _start_values(self, candidate: EffectCandidate) -> Array | None:
@@ -217,11 +221,11 @@ class CandidateScreening:
         return np.array(rows) if rows else None
 
 
-def _delay_grid(model: Model, shifts: Sequence[float]) -> Iterator[Model]:
+def _delay_grid(model: Model, shifts: Sequence[float], outputs: Sequence[float]) -> Iterator[Model]:
     """The model at the grid points within the bounds of the delays."""
     total = model.delays.sum(axis=0)
     for shift in shifts:
-        for output in _OUTPUT_DELAYS_S:
+        for output in outputs:
             delays = np.stack([total + shift - output, np.full_like(total, output)])
             if (delays > -1e-9).all() and (delays <= MAX_DELAYS_S[:, None] + 1e-9).all():
                 yield model.with_delays(delays)

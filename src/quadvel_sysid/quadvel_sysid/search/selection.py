@@ -92,7 +92,7 @@ class Search:
             evaluator: Data that models are fitted to and compared on.
             on_progress: Receives a short text before each step.
         """
-        self.evaluator, self._on_progress = evaluator, on_progress
+        self.evaluator, self._options, self._on_progress = evaluator, evaluator.options, on_progress
         self._candidate_cache: dict[tuple[object, ...], Candidates] = {}
 
     def best(self, start: Model) -> SearchResult:
@@ -134,7 +134,8 @@ class Search:
         least = min(one.criterion for one in models)
         margin = EQUIVALENCE_MARGIN * len(self.evaluator.noise)
         equivalent = [one for one in models if one.criterion < least + margin]
-        return SearchResult(self.prune(min(equivalent, key=_regressor_count)), effects, record)
+        key = _regressor_count if self._options.effects_before_regressors else _criterion
+        return SearchResult(self.prune(min(equivalent, key=key)), effects, record)
 
     def residual_correlates(self, fitted: FittedModel) -> tuple[str, ...]:
         """Return the signals that the residual correlates with most.
@@ -194,6 +195,8 @@ class Search:
 
     def _replace_by_special_case(self, fitted: FittedModel, index: int) -> FittedModel:
         """Replace an effect by its special case (Stribeck by Coulomb friction), unless rows need it."""
+        if not self._options.special_cases:
+            return fitted
         effect = fitted.model.effects[index]
         special_case = effect.candidate.special_case(effect.parameters)
         if special_case is None:
@@ -258,7 +261,7 @@ class Search:
     def _rejection_reason(self, before: FittedModel, after: FittedModel, tested_count: int) -> str:
         """Reason why an added effect is rejected; empty if it is accepted."""
         grown = len(after.model.effects) > len(before.model.effects)
-        if grown and duplicates_effect(after.last_effect, before.model.effects):
+        if grown and self._options.no_repeats and duplicates_effect(after.last_effect, before.model.effects):
             return "the same joints already have an effect that is its special or its general case"
         if grown and not after.last_effect.is_excited(after.model.signals):
             return "the joints moved too little to distinguish it from other effects"
@@ -284,7 +287,7 @@ class Search:
         """Models with gains, or delays, for each kind of joint and for each joint."""
         model, joints = before.model, before.model.samples.joints
         found = []
-        for groups in joint_groupings(joints):
+        for groups in joint_groupings(joints) if self._options.gains_of_each_joint else ():
             finer = len(np.unique(groups))
             if finer > len(np.unique(model.gain_groups)):
                 found.append(attrs.evolve(model, gain_groups=groups))
@@ -302,7 +305,7 @@ class Search:
         Returns:
             The model with the necessary effects.
         """
-        while len(fitted.model.effects) > max(kept, 1):
+        while self._options.elimination and len(fitted.model.effects) > max(kept, 1):
             model = fitted.model
             removable = range(len(model.effects) - kept)
             reduced = min(
@@ -359,6 +362,11 @@ def _regressor_count(fitted: FittedModel) -> tuple[int, float]:
     return count, fitted.criterion
 
 
+def _criterion(fitted: FittedModel) -> tuple[int, float]:
+    """The criterion alone, as a key."""
+    return 0, fitted.criterion
+
+
 def duplicates_effect(effect: AppliedEffect, others: Iterable[AppliedEffect]) -> bool:
     """Whether an effect is nested with one that acts on the same joints already.
 
@@ -389,7 +397,7 @@ def _structure_key(model: Model) -> tuple[object, ...]:
     effects = [
         (
             effect.candidate.name,
-            str(effect.candidate.settings),
+            str(effect.candidate.effect.settings),
             effect.active.tobytes(),
             effect.groups.tobytes(),
         )

@@ -12,6 +12,7 @@ import numpy as np
 
 from quadvel_description.arrays import Array, Bools
 
+from ..data.signals import Samples
 from ..logs.log import Log
 
 FILTER_SPAN_S = 0.016
@@ -24,12 +25,12 @@ RIDGE_PENALTY = 1e-4
 """Ridge penalty on the weights of signals of unit variance, times the number of rows."""
 
 
-def baseline_errors(logs: Sequence[Log], fitted: Bools, heldout: Bools) -> dict[str, dict[str, float | None]]:
+def baseline_errors(samples: Samples, fitted: Bools, heldout: Bools) -> dict[str, dict[str, float | None]]:
     """Compute the held-out errors of the baselines.
 
     Args:
-        logs: The logs, one after the other.
-        fitted: (N, J) rows of all logs that are fitted.
+        samples: Rows of all logs.
+        fitted: (N, J) rows that are fitted.
         heldout: (N, J) rows that are held out.
 
     Returns:
@@ -37,40 +38,27 @@ def baseline_errors(logs: Sequence[Log], fitted: Bools, heldout: Bools) -> dict[
         the torque's variance.
     """
     squares = {"joint_pd": 0.0, "ridge": 0.0}
-    torques = [np.asarray(log.without_feed_forward().tau, dtype=float) for log in logs]
+    torque = np.concatenate([np.asarray(log.without_feed_forward().tau, dtype=float) for log in samples.logs])
+    step = max(LAG_STEP_S, float(np.median([log.period for log in samples.logs])))
+    past = tuple(step * np.arange(max(1, round(FILTER_SPAN_S / step)) + 1))
     for j in range(fitted.shape[1]):
-        tau = np.concatenate([torque[:, j] for torque in torques])
-        fit, reported = fitted[:, j], heldout[:, j]
+        tau, fit, reported = torque[:, j], fitted[:, j], heldout[:, j]
         laws = [
-            _regressors(logs, j, (delay,), (0.0,))
+            _regressors(samples, j, (delay,), (0.0,))
             for delay in np.arange(0.0, MAX_DELAY_S + LAG_STEP_S / 2, LAG_STEP_S)
         ]
         best = min(
             (_residual(law, tau, fit, 0.0) for law in laws), key=lambda one: float(np.mean(one[fit] ** 2))
         )
         squares["joint_pd"] += float(np.sum(best[reported] ** 2))
-        step = max(LAG_STEP_S, float(np.median([log.period for log in logs])))
-        past = tuple(step * np.arange(max(1, round(FILTER_SPAN_S / step)) + 1))
-        miss = _residual(_regressors(logs, j, past, past), tau, fit, RIDGE_PENALTY)
+        miss = _residual(_regressors(samples, j, past, past), tau, fit, RIDGE_PENALTY)
         squares["ridge"] += float(np.sum(miss[reported] ** 2))
     count = max(int(heldout.sum()), 1)
-    variance = torque_variance(measured_torque(logs), heldout)
+    variance = torque_variance(samples.tau, heldout)
     return {
         name: {"heldout_mse": total / count, "heldout_explained": explained_share(total / count, variance)}
         for name, total in squares.items()
     }
-
-
-def measured_torque(logs: Sequence[Log]) -> Array:
-    """Concatenate the measured torque of logs.
-
-    Args:
-        logs: The logs.
-
-    Returns:
-        (N, J) torque, N m.
-    """
-    return np.concatenate([np.asarray(log.tau, dtype=float) for log in logs])
 
 
 def torque_variance(torque: Array, rows: Bools) -> float:
@@ -101,9 +89,11 @@ def explained_share(mse: float, variance: float) -> float | None:
     return 1.0 - mse / variance if variance > 0.0 else None
 
 
-def _regressors(logs: Sequence[Log], j: int, commands: Sequence[float], states: Sequence[float]) -> Array:
+def _regressors(samples: Samples, j: int, commands: Sequence[float], states: Sequence[float]) -> Array:
     """Regressors (N, K) of joint `j`: commands, angles and speeds at the given delays (s), and 1."""
-    return np.concatenate([np.stack([*_log_regressors(log, j, commands, states)], axis=1) for log in logs])
+    return np.concatenate(
+        [np.stack([*_log_regressors(log, j, commands, states)], axis=1) for log in samples.logs]
+    )
 
 
 def _log_regressors(log: Log, j: int, commands: Sequence[float], states: Sequence[float]) -> Iterator[Array]:

@@ -1,0 +1,1 @@
+"""Readers of measured logs: recordings, and tables of all formats."""

@@ -1,0 +1,307 @@
+"""Names of a log's fields in a file: their own, aliases of other tools, or those of a map file.
+
+A map file is YAML with one line for each field that has another name:
+
+    t: {from: timestamp, scale: 1.0e-6}        # times 1e-6: microseconds
+    q: positions                               # an (N, J) array, or columns positions/JOINT
+    dq: [hip_speed, knee_speed]                # a column for each joint
+    tau: null                                  # left out
+    kp: {value: 35.0}                          # not in the file
+    q_des: {from: goal, scale: [1.0, -1.0]}    # for each joint
+    # In another file, whose name has `control` in place of `state`:
+    t_cmd: {from: timestamp, scale: 1.0e-6, file: [state, control]}
+    q_des_cmd: {from: positions, file: [state, control]}
+    joint_names: [hip, knee]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+
+from quadvel_description.arrays import Floats
+from quadvel_description.bounded_yaml import read_yaml
+
+from ..findings import format_names
+from ..log import LogError
+from . import files
+from .names import ALL_JOINTS, FIELDS, JOINT_NAMES_FIELD, resolve_columns
+from .raw import RawArrays
+from .units import si_factor
+
+
+def _check_keys(mapping: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
+    """Raise LogError for a key that is not known."""
+    for name in mapping:
+        if name not in known:
+            raise LogError(f"{where}{name}: unknown, expected one of {', '.join(known)}")
+
+
+def _is_numeric(value: Any) -> bool:
+    """Whether a value of YAML is a number or a list of numbers."""
+    values = value if isinstance(value, list) else [value]
+    return all(isinstance(one, (int, float)) and not isinstance(one, bool) for one in values)
+
+
+@attrs.frozen
+class Source:
+    """Where a map file finds one field: in columns of a file, as a constant, or not at all.
+
+    Attributes:
+        columns: Names of the columns; empty if the field is constant or left out.
+        scale: Factor to SI units, one or one for each joint. None: the unit that the file states,
+            else SI.
+        value: Constant value, one or one for each joint, or None.
+        file: For a field in another file: the part of the log's file name to replace, and its
+            replacement.
+    """
+
+    columns: tuple[str, ...] = ()
+    scale: float | list[float] | None = None
+    value: Any = None
+    file: tuple[str, str] | None = None
+
+    @classmethod
+    def parse(cls, given: Any, where: str) -> Source:
+        """Parse one entry of a map file.
+
+        Args:
+            given: The entry as YAML gives it.
+            where: File and field, for error messages.
+
+        Returns:
+            The source.
+
+        Raises:
+            LogError: A key is unknown or a value has the wrong type.
+        """
+        entry = given if isinstance(given, dict) else {"from": given}
+        _check_keys(entry, ("from", "scale", "value", "file"), f"{where}/")
+        names = entry.get("from")
+        names = names if isinstance(names, list) else [] if names is None else [names]
+        scale, value, file = entry.get("scale"), entry.get("value"), entry.get("file")
+        for field, good, expected in (
+            ("from", all(isinstance(name, str) for name in names), "a name or a list of names"),
+            ("scale", scale is None or _is_numeric(scale), "a number, or one for each joint"),
+            ("value", value is None or _is_numeric(value), "a number, or one for each joint"),
+            (
+                "file",
+                file is None or (isinstance(file, list) and len(file) == 2 and all(isinstance(x, str) for x in file)),
+                "two parts of a file name, the second in place of the first",
+            ),
+        ):  # fmt: skip
+            if not good:
+                raise LogError(f"{where}/{field}: found {entry[field]!r}, expected {expected}")
+        return cls(tuple(names), scale, value, tuple(file) if file else None)
+
+    def file_of(self, path: Path) -> Path:
+        """Return the file that holds the field.
+
+        Args:
+            path: The log's own file.
+
+        Returns:
+            Path of the file.
+        """
+        return path if self.file is None else path.with_name(path.name.replace(*self.file))
+
+
+@attrs.frozen
+class ColumnMap:
+    """A parsed map file. Fields without an entry keep their usual names.
+
+    Attributes:
+        sources: Source of each field that has an entry.
+        joints: Names of the joints, in the order of the columns; empty if not given.
+    """
+
+    sources: Mapping[str, Source] = attrs.field(factory=dict)
+    joints: tuple[str, ...] = ()
+
+    @classmethod
+    def load(cls, path: Path) -> ColumnMap:
+        """Read a map file.
+
+        Args:
+            path: The file.
+
+        Returns:
+            The map.
+
+        Raises:
+            LogError: An entry is wrong; the message names it.
+            OSError: The file cannot be read.
+        """
+        try:
+            given = read_yaml(path, "a YAML file of column names")
+        except ValueError as error:
+            raise LogError(str(error)) from None
+        if not isinstance(given, dict):
+            raise LogError(
+                f"{path}: found {str(given)[:60]!r}, expected a line for each field, such as q: dof_pos"
+            )
+        _check_keys(given, (*FIELDS, JOINT_NAMES_FIELD), f"{path}: ")
+        joints = given.pop(JOINT_NAMES_FIELD, [])
+        if not isinstance(joints, list) or not all(isinstance(name, str) for name in joints):
+            raise LogError(f"{path}: {JOINT_NAMES_FIELD}: found {joints!r}, expected a list of names")
+        return cls({name: Source.parse(one, f"{path}: {name}") for name, one in given.items()}, tuple(joints))
+
+
+def read_fields(path: Path, names: ColumnMap) -> tuple[dict[str, Floats], list[str] | None, list[str]]:
+    """Read the fields of a log from its file or files.
+
+    Args:
+        path: The log's own file.
+        names: The map of columns.
+
+    Returns:
+        Arrays by field in SI units; names of the joints, or None if not found; remarks about what
+        was assumed.
+    """
+    fields: dict[str, Floats] = {}
+    remarks: list[str] = []
+    joints: list[str] | None = list(names.joints) or None
+    places = dict.fromkeys([path, *(source.file_of(path) for source in names.sources.values())])
+    for place in places:
+        mine = {name: one for name, one in names.sources.items() if one.file_of(path) == place}
+        plain = place == path
+        raw = files.read_file(place, partial(_choose_columns, plain, mine))
+        remarks += raw.remarks
+        if plain and joints is None and JOINT_NAMES_FIELD in raw.arrays:
+            joints = [str(name).strip() for name in np.ravel(raw.arrays[JOINT_NAMES_FIELD])]
+        for name, source in mine.items():
+            if source.value is not None:
+                fields[name] = np.asarray(source.value, dtype=float)
+            elif source.columns:
+                columns, own = _mapped_columns(place, name, source.columns, raw, joints)
+                fields[name] = _stack_columns(place, name, columns, raw, source.scale)
+                joints = joints or (own if name == "q" else None)
+        if plain:
+            joints = _add_unmapped(place, raw, names, fields, joints, remarks)
+    return fields, joints, remarks
+
+
+def _choose_columns(plain: bool, sources: Mapping[str, Source], there: Sequence[str]) -> dict[str, str]:
+    """Select the columns that are needed, each with its field."""
+    chosen: dict[str, str] = {}
+    for field, source in sources.items():
+        for column in source.columns:
+            chosen |= {name: field for name in there if name == column or name.startswith(f"{column}/")}
+    if plain:
+        for field, columns in _unmapped_columns(there, sources).items():
+            chosen |= {name: field for name in columns.values() if name not in chosen}
+        chosen |= {JOINT_NAMES_FIELD: JOINT_NAMES_FIELD} if JOINT_NAMES_FIELD in there else {}
+    return chosen
+
+
+def _unmapped_columns(there: Sequence[str], sources: Mapping[str, Source]) -> dict[str, dict[str, str]]:
+    """Columns of the fields without an entry; a column that an entry uses holds nothing else."""
+    used = {column for one in sources.values() if one.file is None for column in one.columns}
+    free = [name for name in there if name not in used and name.partition("/")[0] not in used]
+    return {field: columns for field, columns in resolve_columns(free).items() if field not in sources}
+
+
+def _add_unmapped(
+    path: Path,
+    raw: RawArrays,
+    names: ColumnMap,
+    fields: dict[str, Floats],
+    joints: list[str] | None,
+    remarks: list[str],
+) -> list[str] | None:
+    """Add the fields without an entry, by own name or alias; return the joints that q names."""
+    used = {column for one in names.sources.values() if one.file is None for column in one.columns}
+    found = _unmapped_columns([*raw.arrays, *raw.others], names.sources)
+    for field, columns in found.items():
+        column = next(iter(columns.values()))
+        own = [joint for joint in columns if joint != ALL_JOINTS]
+        if column.partition("/")[0] != field:
+            remarks.append(f"{field}: read from {format_names([repr(name) for name in columns.values()])}")
+        if own:
+            joints, ordered = _in_order(path, field, own, joints)
+            columns = {joint: columns[joint] for joint in ordered}
+        fields[field] = _stack_columns(path, field, list(columns.values()), raw, None, own != [])
+        used |= set(columns.values())
+    others = [
+        name
+        for name in (*raw.others, *raw.arrays)
+        if name and name != JOINT_NAMES_FIELD and not _is_used(name, used)
+    ]
+    if others:
+        remarks.append(f"{others[0]}: not used, as no log has such fields: {format_names(others)}")
+    return joints
+
+
+def _is_used(name: str, used: Collection[str]) -> bool:
+    """Whether a column, or the group it belongs to, is used."""
+    return name in used or name.partition("/")[0] in used
+
+
+def _in_order(
+    path: Path, field: str, own: list[str], joints: list[str] | None
+) -> tuple[list[str], list[str]]:
+    """The log's joints given those of a field's columns, and the columns in the log's order."""
+    if joints and sorted(own) == sorted(joints):
+        return joints, joints
+    if joints and field != "q":
+        odd = sorted(set(own) ^ set(joints))
+        raise LogError(f"{path}: {field}/{odd[0]}: the columns of {field} and of q name different joints")
+    return (own if field == "q" or joints is None else joints), own
+
+
+def _mapped_columns(
+    path: Path, field: str, columns: tuple[str, ...], raw: RawArrays, joints: list[str] | None
+) -> tuple[list[str], list[str] | None]:
+    """The columns of a map's entry, and their joints: `positions` may mean `positions/knee`."""
+    if len(columns) == 1 and columns[0] not in raw.arrays:
+        of_joints = {name.partition("/")[2]: name for name in raw.arrays if name.startswith(f"{columns[0]}/")}
+        if of_joints:
+            _, ordered = _in_order(path, field, list(of_joints), joints)
+            return [of_joints[joint] for joint in ordered], ordered
+    for name in columns:
+        if name not in raw.arrays:
+            raise LogError(
+                f"{path}: {field}: no '{name}' in it, found {format_names([*raw.arrays, *raw.others], 12)}"
+            )
+    return list(columns), None
+
+
+def _stack_columns(
+    path: Path,
+    field: str,
+    columns: Sequence[str],
+    raw: RawArrays,
+    scale: float | list[float] | None,
+    of_joints: bool = False,
+) -> Floats:
+    """Stack columns to one array in SI units, without trailing rows that hold no number."""
+    parts = [raw.arrays[name] * _unit_factor(path, name, raw.units.get(name), scale) for name in columns]
+    values = np.stack(parts, 1) if len(columns) > 1 or of_joints else parts[0]
+    if scale is not None:
+        values = values * np.asarray(scale)
+    if values.ndim == 0:
+        return values
+    there = ~np.isnan(values)
+    whole = np.flatnonzero(there if there.ndim == 1 else there.all(axis=1))
+    if len(values) and not whole.size:
+        raise LogError(
+            f"{path}: {field}: no row holds a number for each joint, {len(values)} rows are not finite"
+        )
+    return values[: whole[-1] + 1 if whole.size else 0]
+
+
+def _unit_factor(path: Path, column: str, unit: str | None, scale: Any) -> float:
+    """Factor to SI from the unit that the file states; 1 if the map gives a scale."""
+    if unit is None or scale is not None:
+        return 1.0
+    found = si_factor(unit)
+    if found is None:
+        raise LogError(
+            f"{path}: {column}: the unit '{unit}' is unknown, expected s, rad, N m or the like; --columns gives its scale"
+        )
+    return found
