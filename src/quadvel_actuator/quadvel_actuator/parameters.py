@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from quadvel_description.bounded_yaml import read_yaml
-from quadvel_description.fields import Numbers, field, refusal
+from quadvel_description.fields import Numbers, field, positive, refusal
 from quadvel_description.records import structure_record
 
 SCHEMA = 1
@@ -105,13 +105,13 @@ class ActuatorParameters:
 
     schema: int = field(one_of=(SCHEMA,), whole=True)
     name: str
-    kp_ref: float = field(above=0.0)
-    kd_ref: float = field(above=0.0)
+    kp_ref: float = positive()
+    kd_ref: float = positive()
     delta_kp: Numbers = field(at_least=-np.inf)
     delta_kd: Numbers = field(at_least=-np.inf)
     pairs: tuple[DelayPair, ...] = attrs.field(converter=_to_tuple)
     torque_noise: float = field(at_least=0.0)
-    torque_limit: Numbers = field(above=0.0)
+    torque_limit: Numbers = positive()
     effects: tuple[Effect, ...] = attrs.field(converter=_to_tuple, default=())
     joints: tuple[str, ...] = attrs.field(converter=_to_tuple, default=())
 

@@ -75,6 +75,10 @@ def field(
     )
 
 
+positive = partial(field, above=0.0)
+"""Declare a field of a positive number, or of several."""
+
+
 def refusal(record: object, name: str, found: object, expected: str) -> ValueError:
     """Create the error of a wrong value.
 

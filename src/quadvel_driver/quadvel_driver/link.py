@@ -18,7 +18,7 @@ from collections.abc import Callable
 import attrs
 import numpy as np
 
-from quadvel_description.fields import field
+from quadvel_description.fields import field, positive
 from quadvel_description.robot import COMMAND_LOWER, COMMAND_UPPER, TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_nodes.messages import QUATERNION_TOLERANCE
@@ -71,10 +71,10 @@ class LinkConfig:
         whole=True,
     )
     interface: str = field("", "network interface to use alone, such as eth0; empty: any")
-    command_timeout: float = field(
-        0.02, "s without a new low_cmd after which the driver brakes the joints", above=0.0, at_most=0.5
+    command_timeout: float = positive(
+        0.02, "s without a new low_cmd after which the driver brakes the joints", at_most=0.5
     )
-    damping_kd: float = field(5.0, "gain with which it brakes them, N m s/rad", above=0.0, at_most=20.0)
+    damping_kd: float = positive(5.0, "gain with which it brakes them, N m s/rad", at_most=20.0)
 
     @property
     def board(self) -> tuple[str, int]:

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from quadvel_description.arrays import Array
-from quadvel_description.fields import field
+from quadvel_description.fields import field, positive
 from quadvel_description.frames import BASE, ODOM, FramePose, footprint
 from quadvel_description.kinematics import rotate
 from quadvel_description.state import RobotState
@@ -62,7 +62,7 @@ class EstimatorParameters(Scheduling):
 
     kind: str = field("learned", f"how velocity is estimated: {' or '.join(KINDS)}", one_of=KINDS)
     model: str = field("", "file of the learned estimator's network, ONNX; empty: the shipped one")
-    reset_gap: float = field(0.1, "time without a state after which the estimator is reset, s", above=0.0)
+    reset_gap: float = positive(0.1, "time without a state after which the estimator is reset, s")
     odom_frame: str = field(ODOM, "frame of the odometry's pose")
     body_frame: str = field(BASE, "frame of the velocities, the odometry's child")
     publish_tf: bool = field(

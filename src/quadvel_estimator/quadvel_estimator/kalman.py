@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadvel_description.arrays import Array
-from quadvel_description.fields import field
+from quadvel_description.fields import field, positive
 from quadvel_description.kinematics import foot_kinematics, rotation_matrix
 from quadvel_description.robot import GRAVITY
 from quadvel_description.state import RobotState
@@ -58,13 +58,13 @@ class KalmanConfig:
             torques, which every robot has).
     """
 
-    accelerometer: float = field(16.2, above=0.0, tuning=(0.05, 50.0))
-    foot_position: float = field(0.0102, above=0.0, tuning=(1e-4, 0.2))
-    foot_velocity: float = field(0.465, above=0.0, tuning=(0.01, 2.0))
-    foot_walk: float = field(0.00296, above=0.0, tuning=(1e-4, 0.5))
-    slip_gate: float = field(0.564, above=0.0, tuning=(0.1, 10.0))
-    contact_force: float = field(2.42, above=0.0, tuning=(0.5, 60.0))
-    contact_ramp: float = field(3.34, above=0.0, tuning=(0.5, 150.0))
+    accelerometer: float = positive(16.2, tuning=(0.05, 50.0))
+    foot_position: float = positive(0.0102, tuning=(1e-4, 0.2))
+    foot_velocity: float = positive(0.465, tuning=(0.01, 2.0))
+    foot_walk: float = positive(0.00296, tuning=(1e-4, 0.5))
+    slip_gate: float = positive(0.564, tuning=(0.1, 10.0))
+    contact_force: float = positive(2.42, tuning=(0.5, 60.0))
+    contact_ramp: float = positive(3.34, tuning=(0.5, 150.0))
     contact_source: Literal["foot_force", "torque"] = field("torque", one_of=("foot_force", "torque"))
 
     @classmethod

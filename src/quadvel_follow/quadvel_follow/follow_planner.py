@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadvel_description.arrays import Array
-from quadvel_description.fields import field
+from quadvel_description.fields import field, positive
 
 from .clearance import Clearance
 from .clusters import Scan
@@ -92,32 +92,26 @@ class FollowConfig:
         ValueError: A number is not finite or not positive, or the side is unknown.
     """
 
-    distance: float = field(1.5, "distance to the person, m", above=0.0)
+    distance: float = positive(1.5, "distance to the person, m")
     side: str = field("behind", "place of the robot: behind, left or right of the person", one_of=SIDES)
-    clearance: float = field(0.3, "desired clearance between outline and obstacles, m", above=0.0)
-    max_velocity: Axes = field((2.5, 0.6, 1.5), "largest commanded vx, vy, wz, m/s, rad/s", above=0.0)
-    acceleration: Axes = field(
-        (1.2, 0.8, 1.5), "largest change of a command away from zero, m/s^2, rad/s^2", above=0.0
+    clearance: float = positive(0.3, "desired clearance between outline and obstacles, m")
+    max_velocity: Axes = positive((2.5, 0.6, 1.5), "largest commanded vx, vy, wz, m/s, rad/s")
+    acceleration: Axes = positive(
+        (1.2, 0.8, 1.5), "largest change of a command away from zero, m/s^2, rad/s^2"
     )
-    deceleration: Axes = field(
-        (2.5, 1.5, 3.0), "largest change of a command towards zero, m/s^2, rad/s^2", above=0.0
-    )
-    stop_deceleration: Axes = field(
-        (5.0, 4.0, 8.0), "the same for an immediate stop, m/s^2, rad/s^2", above=0.0
-    )
-    length: float = field(0.65, "length of the robot's outline, legs included, m", above=0.0)
-    width: float = field(0.35, "width of the robot's outline, m", above=0.0)
+    deceleration: Axes = positive((2.5, 1.5, 3.0), "largest change of a command towards zero, m/s^2, rad/s^2")
+    stop_deceleration: Axes = positive((5.0, 4.0, 8.0), "the same for an immediate stop, m/s^2, rad/s^2")
+    length: float = positive(0.65, "length of the robot's outline, legs included, m")
+    width: float = positive(0.35, "width of the robot's outline, m")
     laser_x: float = field(
         0.25, "position of the laser on the robot: forward, m; as in the shipped worlds", at_least=-np.inf
     )
     laser_y: float = field(0.0, "position of the laser on the robot: left, m", at_least=-np.inf)
     laser_yaw: float = field(0.0, "yaw of the laser on the robot, rad", at_least=-np.inf)
-    scan_timeout: float = field(0.2, "silence of the scan after which the robot stops, s", above=0.0)
-    odom_timeout: float = field(0.2, "silence of the odometry after which the robot stops, s", above=0.0)
-    person_timeout: float = field(0.2, "silence of the tracker after which the person is lost, s", above=0.0)
-    robot_timeout: float = field(
-        0.5, "silence of the controller after which its last refusal expires, s", above=0.0
-    )
+    scan_timeout: float = positive(0.2, "silence of the scan after which the robot stops, s")
+    odom_timeout: float = positive(0.2, "silence of the odometry after which the robot stops, s")
+    person_timeout: float = positive(0.2, "silence of the tracker after which the person is lost, s")
+    robot_timeout: float = positive(0.5, "silence of the controller after which its last refusal expires, s")
 
 
 @attrs.frozen

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 
 from quadvel_description.arrays import Array, Bools
-from quadvel_description.fields import field
+from quadvel_description.fields import positive
 
 from .clusters import Scan
 from .free_space import MEMORY_S, MIN_AGE_S, ScanHistory, check_places, to_frame, to_sensor
@@ -83,23 +83,23 @@ class TrackerConfig:
         forgotten: Time without a leg after which an unconfirmed hypothesis is removed, s.
     """
 
-    acceleration: float = field(0.1, above=0.0)
-    both_legs: float = field(0.1, above=0.0)
-    one_leg: float = field(0.3, above=0.0)
-    first_speed: float = field(0.8, above=0.0)
-    reach: float = field(0.9, above=0.0)
-    possible: float = field(0.15, above=0.0)
-    walked: float = field(0.5, above=0.0)
-    moved: float = field(0.55, above=0.0)
-    surprise: float = field(0.22, above=0.0)
-    pairs: float = field(0.3, above=0.0)
-    belief: float = field(0.6, above=0.0)
-    watched: float = field(1.0, above=0.0)
-    sightings: int = field(8, above=0.0, whole=True)
-    steady: float = field(0.7, above=0.0)
-    patience: float = field(3.0, above=0.0)
-    patience_in_view: float = field(1.5, above=0.0)
-    forgotten: float = field(0.5, above=0.0)
+    acceleration: float = positive(0.1)
+    both_legs: float = positive(0.1)
+    one_leg: float = positive(0.3)
+    first_speed: float = positive(0.8)
+    reach: float = positive(0.9)
+    possible: float = positive(0.15)
+    walked: float = positive(0.5)
+    moved: float = positive(0.55)
+    surprise: float = positive(0.22)
+    pairs: float = positive(0.3)
+    belief: float = positive(0.6)
+    watched: float = positive(1.0)
+    sightings: int = positive(8, whole=True)
+    steady: float = positive(0.7)
+    patience: float = positive(3.0)
+    patience_in_view: float = positive(1.5)
+    forgotten: float = positive(0.5)
 
 
 def deviation(covariance: Array) -> float:

@@ -12,7 +12,7 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 
-from quadvel_description.fields import field
+from quadvel_description.fields import field, positive
 from quadvel_nodes.messages import MessageError, Refusals
 from quadvel_nodes.node import read_parameters, request_exit, run
 
@@ -29,7 +29,7 @@ class TrajectoryParameters:
 
     file: str = field("zju", "CSV or GPX file, or a shipped one: zju, eight")
     closed_loop: bool = field(False, "whether deviations of odom from the trajectory are corrected")
-    speed: float = field(0.5, "speed along a file of places, m/s", above=0.0)
+    speed: float = positive(0.5, "speed along a file of places, m/s")
 
     def load(self) -> Trajectory:
         """Load the trajectory.

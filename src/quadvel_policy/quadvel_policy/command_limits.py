@@ -13,7 +13,7 @@ import numpy as np
 
 from quadvel_description.arrays import Array
 from quadvel_description.command_range import clip_to_command_range, split_target
-from quadvel_description.fields import field
+from quadvel_description.fields import positive
 from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 
@@ -31,16 +31,14 @@ LIMITS = {
 class JointCommandLimits:
     """Limits on joint commands besides those of the robot; each field is a node parameter."""
 
-    max_torque_step: float = field(
+    max_torque_step: float = positive(
         30.0,
         "largest change of a joint's torque from tick to tick, N m",
-        above=0.0,
         at_most=2.0 * float(TORQUE_LIMIT.max()),  # from one torque limit to the other
     )
-    max_power: float = field(
+    max_power: float = positive(
         1800.0,
         "largest mechanical power of all joints together, W",
-        above=0.0,
         at_most=float(TORQUE_LIMIT @ VELOCITY_LIMIT),  # of all drives at their limits
     )
 

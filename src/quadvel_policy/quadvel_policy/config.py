@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import attrs
 
-from quadvel_description.fields import field
+from quadvel_description.fields import field, positive
 
 from .command_limits import JointCommandLimits
 from .guard import FALL_TIME_S, GuardConfig
@@ -21,41 +21,27 @@ class SupervisorConfig:
     guards: GuardConfig = GuardConfig()
     auto_stand: bool = field(False, "stand up once, automatically, as soon as the robot reports")
     require_operator: bool = field(False, "walk only after ~/enable_walking was called (set it on a robot)")
-    stand_kp: float = field(
-        150.0, "gain of standing up, stance and lying down, N m/rad", above=0.0, at_most=MAX_STIFFNESS
+    stand_kp: float = positive(
+        150.0, "gain of standing up, stance and lying down, N m/rad", at_most=MAX_STIFFNESS
     )
-    stand_kd: float = field(
-        4.0, "damping of standing up, stance and lying down, N m s/rad", above=0.0, at_most=MAX_DAMPING
+    stand_kd: float = positive(
+        4.0, "damping of standing up, stance and lying down, N m s/rad", at_most=MAX_DAMPING
     )
-    damping_kd: float = field(
-        5.0, "damping when passive or in fault, N m s/rad", above=0.0, at_most=MAX_DAMPING
+    damping_kd: float = positive(5.0, "damping when passive or in fault, N m s/rad", at_most=MAX_DAMPING)
+    fold_time: float = positive(0.8, "first part of standing up: to the lying posture, s", at_most=60.0)
+    rise_time: float = positive(1.2, "second part of standing up: to the nominal posture, s", at_most=60.0)
+    settle_time: float = positive(0.3, "from walking back to the nominal posture, s", at_most=60.0)
+    lie_down_time: float = positive(1.0, "from standing to the lying posture, s", at_most=60.0)
+    blend_time: float = positive(0.15, "over which the policy's torques fade in, s", at_most=FALL_TIME_S)
+    reset_gap: float = positive(
+        0.02, "time without a state after which the policy's memory is reset, s", at_most=FALL_TIME_S
     )
-    fold_time: float = field(
-        0.8, "first part of standing up: to the lying posture, s", above=0.0, at_most=60.0
+    max_posture_error: float = positive(
+        0.35, "largest joint error at which the robot counts as standing, rad", at_most=1.5
     )
-    rise_time: float = field(
-        1.2, "second part of standing up: to the nominal posture, s", above=0.0, at_most=60.0
+    max_standing_speed: float = positive(
+        0.1, "largest speed at which walking may end in a posture, m/s", at_most=1.0
     )
-    settle_time: float = field(0.3, "from walking back to the nominal posture, s", above=0.0, at_most=60.0)
-    lie_down_time: float = field(1.0, "from standing to the lying posture, s", above=0.0, at_most=60.0)
-    blend_time: float = field(
-        0.15, "over which the policy's torques fade in, s", above=0.0, at_most=FALL_TIME_S
-    )
-    reset_gap: float = field(
-        0.02,
-        "time without a state after which the policy's memory is reset, s",
-        above=0.0,
-        at_most=FALL_TIME_S,
-    )
-    max_posture_error: float = field(
-        0.35, "largest joint error at which the robot counts as standing, rad", above=0.0, at_most=1.5
-    )
-    max_standing_speed: float = field(
-        0.1, "largest speed at which walking may end in a posture, m/s", above=0.0, at_most=1.0
-    )
-    brake_time: float = field(
-        0.6,
-        "in which the policy brings the robot to a stand after a fault, s",
-        above=0.0,
-        at_most=FALL_TIME_S,
+    brake_time: float = positive(
+        0.6, "in which the policy brings the robot to a stand after a fault, s", at_most=FALL_TIME_S
     )

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadvel_description.arrays import Array
-from quadvel_description.fields import field
+from quadvel_description.fields import positive
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_nodes.messages import MessageError
 from quadvel_nodes.stall_free_clock import StallFreeClock
@@ -61,14 +61,13 @@ class ControlConfig:
     """Parameters of the supervisor, and age limits of its inputs; each is a node parameter."""
 
     supervisor: SupervisorConfig = SupervisorConfig()
-    max_velocity_age: float = field(
+    max_velocity_age: float = positive(
         0.05,
         "oldest velocity estimate that is used; after that the Kalman filter replaces it, s",
-        above=0.0,
         at_most=FALL_TIME_S,
     )
-    command_timeout: float = field(
-        0.5, "oldest command that is used; after that the robot stands, s", above=0.0, at_most=FALL_TIME_S
+    command_timeout: float = positive(
+        0.5, "oldest command that is used; after that the robot stands, s", at_most=FALL_TIME_S
     )
 
 

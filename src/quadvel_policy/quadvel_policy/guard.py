@@ -15,7 +15,7 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Array
-from quadvel_description.fields import field
+from quadvel_description.fields import field, positive
 from quadvel_description.robot import LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_nodes.messages import MessageError
@@ -49,88 +49,66 @@ class Level(IntEnum):
 class GuardConfig:
     """Limits of the guards; each field is a parameter of the node `controller`, with its description and unit."""
 
-    max_state_age: float = field(
-        0.05, "oldest state, and longest time without one, before a fault, s", above=0.0, at_most=FALL_TIME_S
+    max_state_age: float = positive(
+        0.05, "oldest state, and longest time without one, before a fault, s", at_most=FALL_TIME_S
     )
-    max_standstill: float = field(
+    max_standstill: float = positive(
         1.0,
         "the same for a simulated robot, whose time stands still while its process does, s",
-        above=0.0,
         at_most=FALL_TIME_S,
     )
     robot_waits: bool = field(
         False,
         "whether the robot's time stands still until a late answer comes, as in a simulator; then lateness is no fault",
     )
-    max_tilt: float = field(
-        1.05,
-        "largest angle between the trunk's and the world's vertical, rad",
-        above=0.0,
-        at_most=0.5 * math.pi,
+    max_tilt: float = positive(
+        1.05, "largest angle between the trunk's and the world's vertical, rad", at_most=0.5 * math.pi
     )
-    max_joint_speed: float = field(
-        1.25, "largest measured joint speed, as a share of what the drive can do", above=0.0, at_most=2.0
+    max_joint_speed: float = positive(
+        1.25, "largest measured joint speed, as a share of what the drive can do", at_most=2.0
     )
-    joint_margin: float = field(
-        0.2, "how far a measured angle may lie outside the mechanical range, rad", above=0.0, at_most=1.0
+    joint_margin: float = positive(
+        0.2, "how far a measured angle may lie outside the mechanical range, rad", at_most=1.0
     )
-    max_encoder_error: float = field(
-        0.35,
-        "largest deviation of a joint's angle from its integrated speed over 0.1 s, rad",
-        above=0.0,
-        at_most=1.5,
+    max_encoder_error: float = positive(
+        0.35, "largest deviation of a joint's angle from its integrated speed over 0.1 s, rad", at_most=1.5
     )
-    max_attitude_error: float = field(
+    max_attitude_error: float = positive(
         0.15,
         "largest deviation of the orientation from the integrated gyroscope over 0.2 s, rad",
-        above=0.0,
         at_most=0.5 * math.pi,
     )
-    max_torque_error: float = field(
+    max_torque_error: float = positive(
         12.0,
         "largest deviation of a drive's torque from the commanded one, mean over 0.1 s, N m",
-        above=0.0,
         at_most=float(TORQUE_LIMIT.max()),
     )
-    max_acceleration_error: float = field(
-        5.0,
-        "largest mean acceleration of the trunk over 0.5 s, without gravity, m/s^2",
-        above=0.0,
-        at_most=50.0,
+    max_acceleration_error: float = positive(
+        5.0, "largest mean acceleration of the trunk over 0.5 s, without gravity, m/s^2", at_most=50.0
     )
-    frozen_time: float = field(
-        0.1, "time after which a sensor whose bits do not change is faulty, s", above=0.0, at_most=FALL_TIME_S
+    frozen_time: float = positive(
+        0.1, "time after which a sensor whose bits do not change is faulty, s", at_most=FALL_TIME_S
     )
-    frozen_tick_time: float = field(
-        0.025, "time after which a tick that does not change is a fault, s", above=0.0, at_most=FALL_TIME_S
+    frozen_tick_time: float = positive(
+        0.025, "time after which a tick that does not change is a fault, s", at_most=FALL_TIME_S
     )
-    frozen_foot_time: float = field(
-        1.0, "the same for a foot's force while walking, s", above=0.0, at_most=60.0
+    frozen_foot_time: float = positive(1.0, "the same for a foot's force while walking, s", at_most=60.0)
+    stuck_time: float = positive(
+        0.5, "time after which a joint that pushes hard and does not move is stuck, s", at_most=FALL_TIME_S
     )
-    stuck_time: float = field(
-        0.5,
-        "time after which a joint that pushes hard and does not move is stuck, s",
-        above=0.0,
-        at_most=FALL_TIME_S,
+    stuck_torque: float = positive(
+        0.8, "torque that counts as pushing hard, as a share of the drive's largest torque", at_most=1.0
     )
-    stuck_torque: float = field(
-        0.8,
-        "torque that counts as pushing hard, as a share of the drive's largest torque",
-        above=0.0,
-        at_most=1.0,
+    max_velocity_error: float = positive(
+        0.8, "largest difference of the velocity estimate and the Kalman filter, m/s", at_most=5.0
     )
-    max_velocity_error: float = field(
-        0.8, "largest difference of the velocity estimate and the Kalman filter, m/s", above=0.0, at_most=5.0
+    velocity_trust_time: float = positive(
+        1.0, "time after which an estimate that is right again is used again, s", at_most=60.0
     )
-    velocity_trust_time: float = field(
-        1.0, "time after which an estimate that is right again is used again, s", above=0.0, at_most=60.0
+    max_temperature: float = positive(
+        80.0, "hottest motor before the robot has to stand, deg C", at_most=120.0
     )
-    max_temperature: float = field(
-        80.0, "hottest motor before the robot has to stand, deg C", above=0.0, at_most=120.0
-    )
-    max_overruns: int = field(
-        20, "deadlines missed in a row before the robot has to stand", above=0.0, at_most=1000
-    )
+    max_overruns: int = positive(20, "deadlines missed in a row before the robot has to stand", at_most=1000)
 
     @property
     def silence_limit(self) -> float:
