@@ -256,7 +256,8 @@ def read_plant(path: Path) -> Callable[[], HiddenPhysics]:
     """
     content = read_yaml(path, "a YAML file of a plant")
     fields = dict(content) if isinstance(content, Mapping) else {"kind": content}
-    if (kind := fields.pop("kind", None)) not in PLANT_KINDS:
+    kind = fields.pop("kind", None)
+    if not isinstance(kind, str) or kind not in PLANT_KINDS:
         raise ValueError(f"{path}: kind: found {kind!r}, expected one of {', '.join(PLANT_KINDS)}")
     values = {name: _by_joint(path, name, value) for name, value in fields.items()}
     make = partial(structure_record, PLANT_KINDS[kind], values, path)
