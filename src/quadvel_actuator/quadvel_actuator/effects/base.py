@@ -165,17 +165,23 @@ class EffectModel(ABC):
     Attributes:
         name: name in the registry, in parameter files and reports.
         stage: where in the drive it acts.
-        parameters: its numbers, in order.
-        has_memory: whether it depends on the past, so that a row depends on the rows before.
         at: where an added torque acts: in the drive, so that it passes the output delay, or at the
             joint without delay.
     """
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
-    parameters: ClassVar[tuple[Parameter, ...]]
-    has_memory: ClassVar[bool] = False
     at: str = attrs.field(default=DRIVE, kw_only=True, validator=one_of(DRIVE, JOINT))
+
+    @property
+    @abstractmethod
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Its numbers, in order; a class attribute unless they depend on a setting."""
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether it depends on the past, so that a row depends on the rows before."""
+        return False
 
     @classmethod
     def parse(cls, given: Mapping[str, Any], joints: Sequence[str]) -> tuple[EffectModel, dict[str, Any]]:
@@ -319,19 +325,19 @@ class ErrorEffect(EffectModel):
 
 
 class TorqueEffect(EffectModel):
-    """Effect on the torque of the PD law."""
+    """Effect on the torque."""
 
     @abstractmethod
     def torque(self, x: Array, s: View, p: Params) -> Array:
         """Compute the changed torque.
 
         Args:
-            x: N m, torque before the effect.
+            x: N m, torque of the drive before the effect.
             s: signals.
             p: parameters.
 
         Returns:
-            N m, the torque in place of `x`.
+            N m, the torque in place of `x`; at stage ADDED the torque to add.
         """
 
     @override
@@ -339,27 +345,10 @@ class TorqueEffect(EffectModel):
         return self.torque(x, s, p)
 
 
-class AddedEffect(EffectModel):
-    """Effect that adds a torque."""
+class AddedEffect(TorqueEffect):
+    """Effect that adds a torque: `torque` returns the torque to add, N m."""
 
     stage = Stage.ADDED
-
-    @abstractmethod
-    def torque(self, x: Array, s: View, p: Params) -> Array:
-        """Compute the torque to add.
-
-        Args:
-            x: N m, torque of the drive without the effect.
-            s: signals.
-            p: parameters.
-
-        Returns:
-            N m, the torque to add.
-        """
-
-    @override
-    def series(self, x: Array, s: View, p: Params) -> Array:
-        return self.torque(x, s, p)
 
 
 class MemoryEffect(EffectModel):

@@ -101,7 +101,7 @@ class Backlash(MemoryEffect):
 
     @property
     @override
-    def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
+    def parameters(self) -> tuple[Parameter, ...]:
         if self.on == "torque":
             return (Parameter("gap", "N m", 0.01, 50.0, 0.3),)
         return (Parameter("gap", "rad", 0.0002, 0.5, 0.01),)

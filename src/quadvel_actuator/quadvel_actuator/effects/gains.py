@@ -72,7 +72,7 @@ class ThermalDrift(TorqueEffect):
 
     @property
     @override
-    def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
+    def parameters(self) -> tuple[Parameter, ...]:
         if self.of == "temperature":
             return (Parameter("rate", "1/K", -0.2, 0.2, 0.005),)
         return (
@@ -108,7 +108,7 @@ class SupplySag(TorqueEffect):
 
     @property
     @override
-    def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
+    def parameters(self) -> tuple[Parameter, ...]:
         return (Parameter("sag", "1", 0.0, 20.0, 0.3), *_limit_parameters(self.what))
 
     @classmethod
@@ -151,7 +151,7 @@ class PowerSag(MemoryEffect):
 
     @property
     @override
-    def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
+    def parameters(self) -> tuple[Parameter, ...]:
         late = Parameter("T", "s", 0.0005, 0.2, 0.01)
         return (Parameter("sag", "1/W", 0.0, 0.5, 0.0005), late, *_limit_parameters(self.what))
 

@@ -76,7 +76,7 @@ class SignalRegressor(AddedEffect):
 
     @property
     @override
-    def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
+    def parameters(self) -> tuple[Parameter, ...]:
         return _weights(self.shape.count)
 
     @property
@@ -86,7 +86,7 @@ class SignalRegressor(AddedEffect):
 
     @property
     @override
-    def has_memory(self) -> bool:  # type: ignore[override]
+    def has_memory(self) -> bool:
         return self.shape.history
 
     @property
