@@ -23,7 +23,7 @@ TEXTS = [
     path
     for pattern in ("*.md", "docs/**/*.md", "src/**/*.md", "src/**/*.py", "ros_ws/*.md", "ros_ws/**/*.xml")
     for path in sorted(ROOT.glob(pattern))
-    if not path.is_relative_to(ROOT / "ros_ws" / "src")
+    if path.name != "CHANGELOG.md" and not path.is_relative_to(ROOT / "ros_ws" / "src")
 ]
 
 

@@ -193,6 +193,17 @@ def test_files_that_are_no_modules_are_installed_by_pip_and_by_ament(package: st
             assert any(file.match(pattern.removeprefix("**/")) for pattern in pip), f"pyproject.toml: {file}"
 
 
+def test_the_full_simulator_is_the_core_of_the_same_version() -> None:
+    core, full = (
+        tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+        for folder in (ROOT, ROOT / "packaging" / "quadvel")
+    )
+    assert full["version"] == core["version"]
+    assert full["dependencies"] == [f"{core['name']}[eval]=={core['version']}"]
+    assert full["requires-python"] == core["requires-python"]
+    assert {"mujoco", "onnxruntime", "matplotlib", "mcap"} <= requirements("eval")
+
+
 def test_viser_is_held_at_the_minor_version_whose_start_is_known() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     (viser,) = (one for one in project["optional-dependencies"]["view"] if one.startswith("viser"))

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from quadvel_bringup import up
+from quadvel_bringup import stack, up
 from quadvel_bringup.exclusivity import RobotAlreadyRunningError
 from quadvel_bringup.stack import Stack
 from quadvel_lab.scripted_walk import ScriptedWalk
@@ -36,7 +36,7 @@ def use_programs(monkeypatch: pytest.MonkeyPatch, program: Callable[[str], str])
     def command(name: str, arguments: Sequence[str]) -> list[str]:
         return [sys.executable, "-S", "-c", program(name)]
 
-    monkeypatch.setattr(up, "process_command", command)
+    monkeypatch.setattr(stack, "process_command", command)
 
 
 def interrupt_when_ready(monkeypatch: pytest.MonkeyPatch, times: int) -> None:

@@ -177,6 +177,12 @@ def test_what_the_format_does_not_know_does_not_reach_who_runs_it(tmp_path: Path
     assert b"evil" not in serialise(read_network(tmp_path / "newer.onnx"))
 
 
+def test_a_file_of_countless_values_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "many.onnx").write_bytes(network().SerializeToString() + b"\xfa\x7f\x00" * 600_000)
+    with pytest.raises(NetworkFileError, match=r"many\.onnx: has more than 500000 values, expected fewer"):
+        read_network(tmp_path / "many.onnx")
+
+
 @pytest.mark.parametrize("path", ["/dev/zero", "/proc/self/mem", "/"])
 def test_what_is_no_file_is_not_opened(path: str) -> None:
     with pytest.raises(NetworkFileError, match=r"no such file|can't be read|not an ONNX network"):

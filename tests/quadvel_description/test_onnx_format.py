@@ -11,7 +11,6 @@ from quadvel_description.onnx_format import (
     MESSAGES,
     UNREAD,
     FormatError,
-    TooManyValuesError,
     message,
     parse,
     serialise,
@@ -84,22 +83,19 @@ def test_a_single_field_that_occurs_twice_is_refused(field: str) -> None:
         parse(serialise(message("ModelProto", **{field: [value, value]})))
 
 
-def test_broken_files_are_read_to_the_end_or_refused() -> None:
+def test_broken_files_are_refused_or_written_as_onnx_reads_them() -> None:
     rng = np.random.default_rng(0)
     content = np.frombuffer(SHIPPED_MODEL.read_bytes(), np.uint8)
-    text = np.flatnonzero(content < 128)[:20_000]  # keys, lengths and names
-    for _ in range(300):
+    keys = np.flatnonzero(content < 128)[:20_000]  # also lengths and names
+    accepted = 0
+    for i in range(120):
         broken = content.copy()
-        broken[rng.choice(text, 3)] = rng.integers(0, 256, 3)
+        broken[rng.choice(keys, 3)] = rng.integers(0, 256, 3)
         try:
-            found = parse(broken[: rng.integers(len(broken))].tobytes())
+            found = serialise(parse(broken[: None if i % 3 else rng.integers(len(broken))].tobytes()))
         except FormatError:
             continue
-        assert parse(serialise(found)) == found
-
-
-@pytest.mark.parametrize("field", [b"\xfa\x7f\x00", b"\x72\x00"], ids=["unknown", "known"])
-def test_a_file_of_countless_values_is_refused_before_all_are_read(field: bytes) -> None:
-    end = b"\x07"  # a wrong key
-    with pytest.raises(TooManyValuesError):
-        parse(field * 600_000 + end)
+        accepted += 1
+        assert serialise(parse(found)) == found
+        assert onnx.load_from_string(found).ByteSize() == len(found)
+    assert 20 < accepted < 100

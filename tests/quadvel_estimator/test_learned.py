@@ -35,7 +35,7 @@ def test_velocity_and_covariance_are_the_scaled_outputs(
         np.testing.assert_allclose(covariance, 0.25 * np.diag(variance), rtol=1e-6)
 
 
-def test_a_reset_forgets_everything(write_estimator: WriteEstimator, standing: State) -> None:
+def test_a_reset_clears_the_memory(write_estimator: WriteEstimator, standing: State) -> None:
     estimator = LearnedEstimator(write_estimator())
     first, _ = estimator.update(standing(0.0), ACTION)
     second, _ = estimator.update(standing(0.005), ACTION)

@@ -39,5 +39,5 @@ def test_without_the_package_a_cluster_is_refused_with_what_to_install(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ValueError, match=r"quadvel\[cluster\]"):
+    with pytest.raises(ValueError, match=r"quadvel-core\[cluster\]"):
         list(run_in_parallel([(divmod, 1, 1)], "tcp://127.0.0.1:1"))

@@ -37,7 +37,7 @@ class Rig:
         )
         self.velocity: Any = np.zeros(3)
         self.inputs: dict[str, Any] = {}  # further fields of TickInput
-        self.asked = JointCommand.damping()
+        self.answer = JointCommand.damping()
 
     @property
     def mode(self) -> str:
@@ -50,10 +50,10 @@ class Rig:
         time, tick = self.state.time + step, self.state.tick + round(1e3 * step)
         self.state = attrs.evolve(self.state, time=time, tick=tick)
         seen = attrs.evolve(self.state, **changes)
-        self.asked = self.supervisor.tick(TickInput(time + age, seen, self.velocity, command, **self.inputs))
-        if self.asked.kp.any():
-            self.state.q = self.asked.q.copy()
-        return self.asked
+        self.answer = self.supervisor.tick(TickInput(time + age, seen, self.velocity, command, **self.inputs))
+        if self.answer.kp.any():
+            self.state.q = self.answer.q.copy()
+        return self.answer
 
     def run(self, seconds: float, command: Any = STILL) -> None:
         for _ in range(round(seconds / PERIOD)):

@@ -38,7 +38,7 @@ def test_silence_from_the_start_is_stance(mux: CommandMux) -> None:
     assert (output.stance, output.source) == (True, "none")
 
 
-def test_the_highest_priority_that_speaks_wins(mux: CommandMux) -> None:
+def test_the_active_source_with_the_highest_priority_wins(mux: CommandMux) -> None:
     output = run(mux, 0.0, 1.0, teleop=FORWARD, planner=BACK)
     np.testing.assert_allclose(output.velocity, FORWARD)
     assert (output.stance, output.source) == (False, "teleop")
@@ -65,7 +65,7 @@ def test_the_command_changes_no_faster_than_allowed(mux: CommandMux) -> None:
     np.testing.assert_allclose(output.velocity, [0.1, 0.025, 0.0])  # 5 m/s^2, on a straight line
 
 
-def test_braking_is_as_quick_as_a_stop_whoever_asks_for_it(mux: CommandMux) -> None:
+def test_braking_is_as_fast_for_a_command_as_for_a_stop(mux: CommandMux) -> None:
     run(mux, 0.0, 1.0, teleop=FORWARD)
     output = run(mux, 1.0, 0.1, teleop=(0.5, 0.0, 0.0))
     np.testing.assert_allclose(output.velocity, [1.0 - 2.0 * 0.1, 0.0, 0.0])
@@ -83,7 +83,7 @@ def test_silence_ramps_to_zero_and_then_asks_for_stance(mux: CommandMux) -> None
 
 
 @pytest.mark.parametrize("stop", ["lock", "stance"])
-def test_a_lock_and_a_request_for_stance_stop_a_speaking_source(mux: CommandMux, stop: str) -> None:
+def test_a_lock_and_a_request_for_stance_stop_an_active_source(mux: CommandMux, stop: str) -> None:
     run(mux, 0.0, 1.0, teleop=FORWARD)
     if stop == "lock":
         mux.locks.add("lock")
@@ -127,7 +127,7 @@ def test_numbers_that_are_not_finite_are_refused_and_change_nothing(mux: Command
     np.testing.assert_allclose(output.velocity, FORWARD)
 
 
-def test_a_velocity_beyond_the_bounds_is_held_to_them(mux: CommandMux) -> None:
+def test_a_velocity_beyond_the_bounds_is_clamped(mux: CommandMux) -> None:
     output = run(mux, 0.0, 6.0, teleop=(1e30, -7.0, 99.0))
     np.testing.assert_allclose(output.velocity, [4.5, -2.2, 6.3])
 
@@ -139,7 +139,7 @@ def test_a_clock_that_is_set_back_makes_every_input_silent(mux: CommandMux) -> N
     assert run(mux, 5.0, 1.0).stance
 
 
-def test_what_was_heard_before_the_clock_was_set_back_is_not_followed_when_its_time_comes_again(
+def test_a_velocity_from_before_the_clock_was_set_back_is_not_followed_later(
     mux: CommandMux,
 ) -> None:
     run(mux, 100.0, 1.0, teleop=FORWARD)
@@ -153,7 +153,7 @@ def test_what_was_heard_before_the_clock_was_set_back_is_not_followed_when_its_t
 @pytest.mark.parametrize(
     "inputs", [[], [TELEOP, MuxInput("teleop", 1, 1.0)], [TELEOP, MuxInput("a", 100, 1.0)]]
 )
-def test_inputs_that_can_not_be_told_apart_are_refused(inputs: list[MuxInput]) -> None:
+def test_inputs_with_equal_names_or_priorities_are_refused(inputs: list[MuxInput]) -> None:
     with pytest.raises(ValueError, match=r"inputs have the (name|priority) list .* expected each"):
         CommandMux(inputs)
 

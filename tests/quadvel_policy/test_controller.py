@@ -180,7 +180,7 @@ def test_a_robot_whose_commands_stop_stands_still(robot: Robot) -> None:
     assert robot.report("walk").stance
 
 
-def test_without_a_fresh_velocity_it_walks_on_the_kalman_filters_and_says_so(robot: Robot) -> None:
+def test_without_a_fresh_velocity_it_walks_on_the_kalman_filters_and_reports_it(robot: Robot) -> None:
     walk(robot)
     robot.velocity = None
     robot.step(16)
@@ -191,7 +191,7 @@ def test_without_a_fresh_velocity_it_walks_on_the_kalman_filters_and_says_so(rob
     robot.graph.wait(lambda: robot.step() and not robot.reports[-1].findings)
 
 
-def test_a_fault_is_told_by_name_and_in_words(robot: Robot) -> None:
+def test_a_fault_is_reported_by_name_and_in_a_sentence(robot: Robot) -> None:
     walk(robot)
     lying_on_its_side = np.array([math.cos(0.7), math.sin(0.7), 0.0, 0.0])
     robot.state.quaternion = lying_on_its_side
@@ -387,7 +387,7 @@ def test_a_robot_whose_time_stands_still_is_not_silent(robot: Robot) -> None:
     assert robot.report("walk").mode_name == "walk"
 
 
-def test_a_robot_that_waits_at_a_tick_that_nobody_heard_of_is_silent(robot: Robot) -> None:
+def test_a_robot_that_waits_at_an_unknown_tick_is_silent(robot: Robot) -> None:
     """Its states are withheld."""
     walk(robot)
     waiting = robot.graph.speak(Waiting, "waiting")
@@ -445,7 +445,7 @@ def test_a_second_robot_on_the_same_topic_is_a_fault_and_refuses_to_be_stood_up(
     robot.graph.wait(lambda: robot.graph.call(SetMode, "controller/set_mode", mode="stance").success)
 
 
-def test_in_real_time_a_driver_that_sends_as_best_it_can_is_heard(
+def test_in_real_time_a_best_effort_driver_is_received(
     write_policy: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Scheduling, "apply", lambda *_: None)  # the tests' process keeps its priority
@@ -464,7 +464,7 @@ def test_in_real_time_a_driver_that_sends_as_best_it_can_is_heard(
 
 
 @pytest.mark.parametrize(("age", "followed"), [(0.1, True), (-0.1, True), (0.6, False), (-60.0, False)])
-def test_a_command_of_another_time_is_not_followed_be_it_old_or_to_come(age: float, followed: bool) -> None:
+def test_a_command_too_old_or_from_the_future_is_not_followed(age: float, followed: bool) -> None:
     assert (_value_if_fresh((100.0 - age, np.ones(4)), 100.0, 0.5) is not None) == followed
 
 

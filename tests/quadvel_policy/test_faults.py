@@ -96,7 +96,7 @@ def silent_drive(rig: Rig, k: int) -> Changes:
     return {
         "q": seen.q,
         "dq": seen.dq,
-        "tau": np.where(np.arange(12) == 2, 0.0, ideal_torque(rig.asked, seen)) + 1e-3,
+        "tau": np.where(np.arange(12) == 2, 0.0, ideal_torque(rig.answer, seen)) + 1e-3,
     }
 
 
@@ -104,7 +104,7 @@ def stuck_joint(rig: Rig, k: int) -> Changes:
     """A knee that was bent by something pushes with all it has and stays where it is."""
     rig.policy.action = np.where(np.arange(12) == 8, 6.0, 0.0).astype(np.float32)
     seen = giving_way(rig, 8, -0.7, k)
-    return {"q": seen.q, "dq": seen.dq, "tau": ideal_torque(rig.asked, seen)}
+    return {"q": seen.q, "dq": seen.dq, "tau": ideal_torque(rig.answer, seen)}
 
 
 def stopped(rig: Rig, seconds: float) -> Changes:
@@ -228,7 +228,7 @@ def check_row(policy: Any, guard: type[Guard], guards: tuple[type[Guard], ...]) 
 
 def check_damping(rig: Rig, case: Case, name: str) -> None:
     assert (rig.mode, rig.supervisor.fault) == ("fault", name)
-    assert_damping(rig.asked)
+    assert_damping(rig.answer)
     reason = rig.supervisor.reason
     rig.run(0.3, FORWARD)
     assert (rig.mode, rig.supervisor.reason) == ("fault", reason)
@@ -306,7 +306,7 @@ def test_postures_are_guarded_as_walking_is(policy: Any, guard: type[Guard], mod
     assert rig.mode == mode
     until_found(rig, attrs.evolve(CASES[name], seconds=CASES[name].seconds + 0.3), name)
     assert (rig.mode, rig.supervisor.fault) == ("fault", name)
-    assert_damping(rig.asked)
+    assert_damping(rig.answer)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -390,7 +390,7 @@ def test_an_action_that_is_not_finite_is_a_fault(policy: Any) -> None:
         ((99.0, 0.0, 0.0, 0.0), "command_out_of_range"),
     ],
 )
-def test_a_command_that_is_not_fit_is_told_and_held(policy: Any, command: Any, name: str) -> None:
+def test_an_unfit_command_is_reported_and_limited(policy: Any, command: Any, name: str) -> None:
     rig = walking(policy)
     rig.tick(command)
     assert rig.mode == "walk"
@@ -421,7 +421,7 @@ def check_limit(policy: Any, name: str) -> None:
     rig = Rig(policy, [guard for guard in GUARDS if guard is not EncoderInconsistent]).walk()
     rig.run(0.2, FORWARD)
     action, changes = LIMIT_CASES[name]
-    command = rig.asked
+    command = rig.answer
     for k in range(6):
         before = command
         rig.policy.action = np.full(12, action * (-1) ** (k * (name == "torque_jumps")), np.float32)

@@ -85,7 +85,7 @@ def test_on_a_slope_a_posture_keeps_the_feet_below_the_trunk(axis: tuple[float, 
     np.testing.assert_allclose(middle[:2], 0.0, atol=1e-9)
 
 
-def test_a_posture_leans_no_further_than_20_degrees_ask_for() -> None:
+def test_a_posture_leans_by_at_most_20_degrees() -> None:
     state = tick_at(0.0, NOMINAL_Q, JointCommand.damping()).state
     state.quaternion = np.array([np.cos(0.5), 0.0, np.sin(0.5), 0.0])  # 1 rad
     assert np.linalg.norm(vertical_offset(state)) == pytest.approx(np.tan(0.35))

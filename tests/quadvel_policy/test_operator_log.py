@@ -20,7 +20,7 @@ class Run:
 
     def __init__(self, policy: Any) -> None:
         self.supervisor = Supervisor(policy)
-        self.announcements = OperatorLog(self.supervisor)
+        self.log = OperatorLog(self.supervisor)
         self._ticks = 0
 
     def tick(self, command: Any, count: int = 1) -> list[tuple[bool, str]]:
@@ -34,11 +34,11 @@ class Run:
                 time, 5 * self._ticks, NOMINAL_Q, zeros, zeros, upright, zeros[:3], zeros[:3], zeros[:4]
             )
             self.supervisor.tick(TickInput(time, state, np.zeros(3), command))
-            sentences += self.announcements.changes()
+            sentences += self.log.changes()
         return sentences
 
 
-def test_each_change_is_told_once_and_a_fault_with_the_way_out_of_it(policy: Any) -> None:
+def test_each_change_is_logged_once_and_a_fault_with_its_recovery(policy: Any) -> None:
     run = Run(policy)
     assert run.tick(STILL, 20) == [(False, "passive: waiting for a mode request")]
     run.supervisor.request("stance")
@@ -47,19 +47,19 @@ def test_each_change_is_told_once_and_a_fault_with_the_way_out_of_it(policy: Any
         (False, "ready; waiting for a velocity command"),
     ]
     assert run.tick(FORWARD, 20) == [(False, "walk: a velocity was commanded")]
-    assert not list(run.announcements.walk_refusals())
+    assert not list(run.log.walk_refusals())
     run.supervisor.fail("a test", "test")
     assert run.tick(FORWARD, 20) == [
         (True, "fault: a test; the joints are damped until passive is requested, then stand_up")
     ]
 
 
-def test_why_a_standing_robot_does_not_walk_is_told_once(policy: Any) -> None:
+def test_the_reason_why_a_standing_robot_does_not_walk_is_logged_once(policy: Any) -> None:
     run = Run(policy)
     run.tick(FORWARD)
     run.supervisor.request("stance")
     run.tick(FORWARD, 80)
     expected = ["follows no velocity: a zero velocity has to be commanded first"]
-    assert list(run.announcements.walk_refusals()) == expected
-    assert list(run.announcements.walk_refusals()) == []
+    assert list(run.log.walk_refusals()) == expected
+    assert list(run.log.walk_refusals()) == []
     assert run.tick(STILL) == [(False, "ready; waiting for a velocity command")]

@@ -43,7 +43,7 @@ def test_steps_carry_the_memory_as_the_lstm_equations_say(write_policy: WritePol
     np.testing.assert_allclose(actions, reference(path, observations), atol=1e-5)
 
 
-def test_a_reset_forgets_everything(write_policy: WritePolicy) -> None:
+def test_a_reset_clears_the_memory(write_policy: WritePolicy) -> None:
     policy = PolicyFile(write_policy())
     observations = np.random.default_rng(2).normal(size=(5, 48)).astype(np.float32)
     first = [policy.step(o) for o in observations]

@@ -40,7 +40,7 @@ def test_the_modes_have_the_numbers_of_the_message() -> None:
 def test_it_starts_passive_and_brakes(rig: Rig) -> None:
     assert_damping(rig.tick(FORWARD))
     assert rig.mode == "passive"
-    assert rig.asked.tick == rig.state.tick
+    assert rig.answer.tick == rig.state.tick
 
 
 def test_standing_up_goes_through_lying_to_the_nominal_posture(rig: Rig) -> None:
@@ -48,18 +48,18 @@ def test_standing_up_goes_through_lying_to_the_nominal_posture(rig: Rig) -> None
     rig.tick()
     rig.supervisor.request("stand_up")
     rig.tick()
-    np.testing.assert_allclose(rig.asked.q, np.minimum(LIE_Q + 0.1, COMMAND_UPPER), atol=1e-6)
+    np.testing.assert_allclose(rig.answer.q, np.minimum(LIE_Q + 0.1, COMMAND_UPPER), atol=1e-6)
     rig.run(0.8)
-    np.testing.assert_allclose(rig.asked.q, LIE_Q, atol=1e-4)
+    np.testing.assert_allclose(rig.answer.q, LIE_Q, atol=1e-4)
     rig.run(1.205)
     assert rig.mode == "stance"
     rig.run(0.3)
-    np.testing.assert_allclose(rig.asked.q, NOMINAL_Q, atol=1e-9)
-    np.testing.assert_array_equal(rig.asked.kp, np.full(12, 150.0))
-    np.testing.assert_array_equal(rig.asked.kd, np.full(12, 4.0))
+    np.testing.assert_allclose(rig.answer.q, NOMINAL_Q, atol=1e-9)
+    np.testing.assert_array_equal(rig.answer.kp, np.full(12, 150.0))
+    np.testing.assert_array_equal(rig.answer.kd, np.full(12, 4.0))
 
 
-def test_it_stands_up_by_itself_once_if_told_so(policy: Any) -> None:
+def test_it_stands_up_by_itself_once_with_auto_stand(policy: Any) -> None:
     rig = Rig(policy, auto_stand=True)
     rig.tick(quaternion=np.array([0.0, 1.0, 0.0, 0.0]))
     assert rig.mode == "passive"  # not while it lies on its back
@@ -70,7 +70,7 @@ def test_it_stands_up_by_itself_once_if_told_so(policy: Any) -> None:
     assert rig.mode == "passive"
 
 
-def test_an_order_ends_standing_up_by_itself(policy: Any) -> None:
+def test_a_request_cancels_standing_up_by_itself(policy: Any) -> None:
     rig = Rig(policy, auto_stand=True)
     rig.tick(quaternion=np.array([0.0, 1.0, 0.0, 0.0]))
     rig.supervisor.request("passive")
@@ -119,17 +119,17 @@ def test_walking_feeds_the_policy_and_uses_its_gains_and_targets(rig: Rig) -> No
     np.testing.assert_allclose(seen[:4], [1.5, -0.5, 0.3, 0.0], atol=1e-6)  # clamped to the policy's limits
     np.testing.assert_allclose(seen[30:33], rig.velocity, atol=1e-6)
     np.testing.assert_allclose(seen[36:], rig.policy.action)
-    np.testing.assert_allclose(rig.asked.target, rig.policy.metadata.action.targets(rig.policy.action))
-    assert rig.asked.mode == MODE_SERVO
-    np.testing.assert_array_equal(rig.asked.kp, np.full(12, 30.0))
-    np.testing.assert_array_equal(rig.asked.kd, np.full(12, 0.5))
+    np.testing.assert_allclose(rig.answer.target, rig.policy.metadata.action.targets(rig.policy.action))
+    assert rig.answer.mode == MODE_SERVO
+    np.testing.assert_array_equal(rig.answer.kp, np.full(12, 30.0))
+    np.testing.assert_array_equal(rig.answer.kd, np.full(12, 0.5))
     np.testing.assert_allclose(rig.supervisor.command, [1.5, -0.5, 0.3, 0.0])
 
 
 def test_walking_starts_with_a_fresh_policy_and_without_a_jump_of_torque(rig: Rig) -> None:
     rig.stand()
     rig.policy.action = np.full(12, 1.0, np.float32)
-    before = rig.asked
+    before = rig.answer
     resets = rig.policy.resets
     q = rig.state.q - 0.1
     last = before.kp * (before.target - q)
@@ -151,7 +151,9 @@ def test_a_stance_command_keeps_the_policy_in_charge(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(("speed", "stance"), [(1.0, 0.0), (0.25, 0.0), (0.15, 1.0), (0.0, 1.0)])
-def test_a_robot_that_is_to_stand_steps_on_until_it_is_slow(rig: Rig, speed: float, stance: float) -> None:
+def test_a_robot_commanded_to_stand_keeps_stepping_until_it_is_slow(
+    rig: Rig, speed: float, stance: float
+) -> None:
     rig.walk()
     rig.velocity = np.array([0.0, speed, 0.0])
     rig.tick(STILL)
@@ -226,7 +228,7 @@ def test_after_a_fault_a_velocity_that_is_still_commanded_does_not_count(rig: Ri
     assert rig.mode == "stance"
 
 
-def test_walking_that_was_asked_for_stands_until_a_zero_velocity_was_commanded(rig: Rig) -> None:
+def test_requested_walking_stands_until_a_zero_velocity_was_commanded(rig: Rig) -> None:
     rig.tick(None)
     rig.supervisor.request("stand_up")
     rig.run(2.5, None)
@@ -244,11 +246,11 @@ def test_lying_down_ends_passive(rig: Rig) -> None:
     assert rig.supervisor.request("lie_down")[0]
     rig.run(0.95)
     assert rig.mode == "lie_down"
-    np.testing.assert_allclose(rig.asked.q, LIE_Q, atol=5e-3)
+    np.testing.assert_allclose(rig.answer.q, LIE_Q, atol=5e-3)
     rig.run(0.1)
     assert rig.mode == "passive"
     assert rig.supervisor.reason == "lies"
-    assert_damping(rig.asked)
+    assert_damping(rig.answer)
 
 
 def test_walking_ends_in_a_posture_only_when_the_robot_stands(rig: Rig) -> None:
@@ -266,7 +268,7 @@ def test_walking_ends_in_a_posture_only_when_the_robot_stands(rig: Rig) -> None:
     assert rig.supervisor.request("stance")[0]
     rig.run(0.4)
     assert rig.mode == "stance"
-    np.testing.assert_allclose(rig.asked.q, NOMINAL_Q)
+    np.testing.assert_allclose(rig.answer.q, NOMINAL_Q)
 
 
 def test_a_standing_robot_may_go_to_stance_at_once_and_a_lying_one_may_not(rig: Rig) -> None:
@@ -297,7 +299,7 @@ def test_unknown_modes_are_refused_by_name(rig: Rig, mode: str) -> None:
     assert message == f"mode is '{mode}', expected one of passive, stand_up, stance, walk, lie_down"
 
 
-def test_nothing_but_passive_is_taken_before_the_robot_reported(rig: Rig) -> None:
+def test_only_passive_is_accepted_before_the_robot_reported(rig: Rig) -> None:
     assert rig.supervisor.request("stand_up") == (False, "the robot has not reported yet")
     assert rig.supervisor.request("passive")[0]
 
@@ -332,7 +334,7 @@ def test_an_action_that_is_not_finite_is_a_fault(rig: Rig) -> None:
     assert "not finite" in rig.supervisor.reason
 
 
-def test_while_somebody_finds_an_obstacle_nothing_moves(policy: Any) -> None:
+def test_a_second_publisher_of_states_keeps_the_joints_damped(policy: Any) -> None:
     rig = Rig(policy, auto_stand=True)
     rig.inputs["duplicate_publisher"] = "low_state has 2 publishers"
     rig.run(0.1)
@@ -354,7 +356,7 @@ def test_a_fault_from_outside_is_latched_and_the_first_reason_stays(rig: Rig) ->
     assert rig.supervisor.reason == "a test"
 
 
-def test_a_limp_robot_is_not_brought_into_fault(rig: Rig) -> None:
+def test_a_damped_robot_does_not_enter_fault(rig: Rig) -> None:
     rig.tick()
     rig.supervisor.fail("a test", "test")
     assert rig.mode == "passive"
@@ -370,7 +372,7 @@ def test_passive_clears_a_fault_and_nothing_else_does(rig: Rig) -> None:
     rig.stand()
 
 
-def test_the_policy_forgets_on_entry_on_a_fault_and_after_a_gap(rig: Rig) -> None:
+def test_the_policy_is_reset_on_entry_on_a_fault_and_after_a_gap(rig: Rig) -> None:
     rig.walk()
     resets = rig.policy.resets
     rig.tick(FORWARD)
@@ -395,19 +397,19 @@ def test_targets_stay_in_the_range_of_commands(make_policy: Callable[..., Any]) 
     assert rig.mode == "stance"
 
 
-def test_what_a_policy_asks_for_beyond_the_range_goes_as_torque(policy: Any) -> None:
+def test_targets_of_the_policy_beyond_the_range_become_torque(policy: Any) -> None:
     rig = Rig(policy, WITHOUT_ENCODERS).walk()
     rig.run(0.2)
     rig.policy.action = np.full(12, 4.0, np.float32)
     wanted = rig.policy.metadata.action.targets(rig.policy.action)
     for _ in range(4):  # torque grows by 30 N m a tick
         rig.tick(FORWARD, q=NOMINAL_Q)
-    np.testing.assert_allclose(rig.asked.q, np.minimum(wanted, COMMAND_UPPER), rtol=1e-12)
-    np.testing.assert_allclose(rig.asked.target, wanted)
+    np.testing.assert_allclose(rig.answer.q, np.minimum(wanted, COMMAND_UPPER), rtol=1e-12)
+    np.testing.assert_allclose(rig.answer.target, wanted)
     rig.policy.action = np.full(12, 1e6, np.float32)
     rig.run(0.02, FORWARD)
-    np.testing.assert_array_less(rig.asked.q, COMMAND_UPPER + 1e-9)
-    np.testing.assert_array_less(rig.asked.tau, TORQUE_LIMIT + 1e-9)
+    np.testing.assert_array_less(rig.answer.q, COMMAND_UPPER + 1e-9)
+    np.testing.assert_array_less(rig.answer.tau, TORQUE_LIMIT + 1e-9)
 
 
 LIMITS = [
@@ -441,7 +443,7 @@ def test_limits_of_the_command_come_from_the_policy(metadata: PolicyMetadata, ri
     np.testing.assert_array_equal(rig.supervisor.command, [low[0], high[1], low[2], 0.0])
 
 
-def test_commands_are_held_together_where_the_policy_says_how(make_policy: Callable[..., Any]) -> None:
+def test_velocity_commands_are_limited_together_by_the_curve_limit(make_policy: Callable[..., Any]) -> None:
     rig = Rig(make_policy(curve_limit=0.6))  # -1 to 1.5, 0.5 m/s, 1 rad/s
     rig.walk()
     for command, expected in (

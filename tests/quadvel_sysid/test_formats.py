@@ -154,7 +154,7 @@ def test_missing_optional_dependency_is_named(
     for module in ("h5py", "pyarrow", "pyarrow.parquet"):
         monkeypatch.setitem(sys.modules, module, None)
     (tmp_path / name).write_bytes(b"x")
-    with pytest.raises(LogError, match=r"pip install 'quadvel\[formats\]'"):
+    with pytest.raises(LogError, match=r"pip install 'quadvel-core\[formats\]'"):
         read_log(tmp_path / name)
 
 

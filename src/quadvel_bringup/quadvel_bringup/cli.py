@@ -116,7 +116,7 @@ DELEGATED_COMMANDS = {
     ),
     "excite": DelegatedCommand(
         "quadvel_lab.excite:excite_command",
-        "eval",
+        "identify",
         LOGS,
         "Run an excitation motion and record it for identification.",
     ),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import attrs
 import numpy as np
@@ -34,9 +35,14 @@ class MuxInput:
     timeout: float = attrs.field(validator=attrs.validators.gt(0.0))
 
 
-def _axes(instance: object, field: attrs.Attribute[Axes], value: Axes) -> None:
-    if len(value) != 3 or not all(math.isfinite(x) and x > 0.0 for x in value):
-        raise ValueError(f"{field.name} is {list(value)}, expected three numbers above 0 (vx, vy, wz)")
+def _axes(default: Axes, description: str) -> Any:
+    """Declare a field of a positive limit of each axis."""
+
+    def check(_: object, field: attrs.Attribute[Axes], value: Axes) -> None:
+        if len(value) != 3 or not all(math.isfinite(x) and x > 0.0 for x in value):
+            raise ValueError(f"{field.name} is {list(value)}, expected three numbers above 0 (vx, vy, wz)")
+
+    return attrs.field(default=default, validator=check, metadata={"description": description})
 
 
 @attrs.frozen(kw_only=True)
@@ -50,27 +56,14 @@ class MuxConfig:
         dead_zone: Velocity that counts as zero if all axes are below it.
     """
 
-    max_velocity: Axes = attrs.field(
-        default=(4.5, 2.2, 6.3),
-        validator=_axes,
-        metadata={"description": "largest vx, vy, wz passed on, m/s, rad/s"},
+    max_velocity: Axes = _axes((4.5, 2.2, 6.3), "largest vx, vy, wz passed on, m/s, rad/s")
+    acceleration: Axes = _axes((2.0, 1.4, 6.0), "largest change of a command away from zero, m/s^2, rad/s^2")
+    stop_acceleration: Axes = _axes(
+        (5.0, 4.0, 8.0),
+        "the same towards zero: braking, and where every source is silent or a lock is set",
     )
-    acceleration: Axes = attrs.field(
-        default=(2.0, 1.4, 6.0),
-        validator=_axes,
-        metadata={"description": "largest change of a command away from zero, m/s^2, rad/s^2"},
-    )
-    stop_acceleration: Axes = attrs.field(
-        default=(5.0, 4.0, 8.0),
-        validator=_axes,
-        metadata={
-            "description": "the same towards zero: braking, and where every source is silent or a lock is set"
-        },
-    )
-    dead_zone: Axes = attrs.field(
-        default=(0.02, 0.02, 0.02),
-        validator=_axes,
-        metadata={"description": "a command below this on every axis counts as zero, m/s, rad/s"},
+    dead_zone: Axes = _axes(
+        (0.02, 0.02, 0.02), "a command below this on every axis counts as zero, m/s, rad/s"
     )
 
 

@@ -20,12 +20,9 @@ from quadvel_nodes.node import read_parameters, run
 
 from .command_mux import CommandMux, MuxConfig, MuxInput, MuxOutput
 from .received import StampCheck, planar_velocity
+from .settings import setting
 
 PERIOD_S = 0.02  # period of the topic `command`
-
-
-def _list_parameter(default: tuple[Any, ...], description: str) -> Any:
-    return attrs.field(default=default, metadata={"description": description})
 
 
 @attrs.frozen(kw_only=True)
@@ -44,20 +41,12 @@ class MuxParameters(MuxConfig):
         ValueError: The lists have different lengths; raised by the constructor.
     """
 
-    names: tuple[str, ...] = _list_parameter(("teleop", "follow", "planner"), "name of each input")
-    topics: tuple[str, ...] = _list_parameter(
-        ("cmd_vel_teleop", "cmd_vel_follow", "cmd_vel"), "topic of each input"
-    )
-    priorities: tuple[int, ...] = _list_parameter((100, 50, 10), "priority of each input, the highest wins")
-    timeouts: tuple[float, ...] = _list_parameter(
-        (0.5, 0.15, 0.5), "silence after which each input is out, s"
-    )
-    lock_topics: tuple[str, ...] = _list_parameter(
-        ("command_lock",), "std_msgs/Bool topics: true stops the robot"
-    )
-    stamped: bool = attrs.field(
-        default=False, metadata={"description": "inputs are TwistStamped instead of Twist"}
-    )
+    names: tuple[str, ...] = setting(("teleop", "follow", "planner"), "name of each input")
+    topics: tuple[str, ...] = setting(("cmd_vel_teleop", "cmd_vel_follow", "cmd_vel"), "topic of each input")
+    priorities: tuple[int, ...] = setting((100, 50, 10), "priority of each input, the highest wins")
+    timeouts: tuple[float, ...] = setting((0.5, 0.15, 0.5), "silence after which each input is out, s")
+    lock_topics: tuple[str, ...] = setting(("command_lock",), "std_msgs/Bool topics: true stops the robot")
+    stamped: bool = setting(False, "inputs are TwistStamped instead of Twist")
 
     def __attrs_post_init__(self) -> None:
         for field in ("topics", "priorities", "timeouts"):

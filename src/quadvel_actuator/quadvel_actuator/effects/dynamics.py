@@ -7,7 +7,6 @@ from typing import Any
 
 import attrs
 import numpy as np
-from scipy.linalg.blas import dtbsv
 from typing_extensions import override
 
 from quadvel_description.arrays import Array
@@ -70,6 +69,8 @@ def lag_series(x: Array, s: Any, time: Array) -> Array:
     """
     # y[k] - d[k] y[k-1] = (1 - d[k]) x[k], with d[k] = exp(-dt[k] / T), and d = 0 where a stretch
     # starts. This is a lower bidiagonal system; all joints and guesses are solved as one.
+    from scipy.linalg.blas import dtbsv  # nodes, which do not filter rows, start without SciPy
+
     gone = np.where(s.start, -1.0, np.expm1(-s.dt / time))  # d - 1
     gone[..., 0, :] = -1.0
     gone, x = (one.swapaxes(-1, -2) for one in np.broadcast_arrays(gone, x))  # (..., J, N)

@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 
 import attrs
 import numpy as np
-from scipy.signal import lfilter
 from typing_extensions import override
 
 from quadvel_description.arrays import Array, Bools, Indices
@@ -236,6 +235,13 @@ class Filter(Shape):
         return total, memory
 
 
+def _filtered(u: Any, gain: complex, factor: complex, memory: Any) -> Any:
+    """Filter z[k] = factor z[k-1] + gain (u[k-1] + u[k]) over the rows, from its memory before them."""
+    from scipy.signal import lfilter  # nodes, which do not filter rows, start without SciPy
+
+    return lfilter([gain, gain], [1.0, -factor], u, axis=0, zi=memory)[0]
+
+
 @attrs.frozen(eq=False)
 class Lag(Shape):
     """The signal, and its first-order lag.
@@ -262,7 +268,7 @@ class Lag(Shape):
         z = np.empty_like(u)
         for first, last in pairwise([*np.flatnonzero(start), len(u)]):
             begin = (kept + half) * u[first : first + 1]
-            z[first:last] = lfilter([half, half], [1.0, -kept], u[first:last], axis=0, zi=begin)[0]
+            z[first:last] = _filtered(u[first:last], half, kept, begin)
         return np.stack([u, z], axis=1)
 
     @override
@@ -315,7 +321,7 @@ class Resonance(Shape):
             part = u[first:last]
             rest = gain * part[:1] / (1.0 - factor)
             begin = factor * rest + 0.5 * gain * part[:1]
-            z[first:last] = lfilter([0.5 * gain, 0.5 * gain], [1.0, -factor], part, axis=0, zi=begin)[0]
+            z[first:last] = _filtered(part, 0.5 * gain, factor, begin)
         return np.stack([u, z.real, z.imag], axis=1)
 
     @override
