@@ -54,21 +54,33 @@ def test_saved_parameters_load_unchanged_with_their_effects(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"schema": 2}, "schema: found 2, expected 1"),
-        ({"kp_ref": -1}, "kp_ref: found -1, expected a gain above 0"),
-        ({"delta_kp": [0.1] * 11}, "delta_kp: found .* expected a number, 3 numbers or 12 numbers"),
-        ({"delta_kd": "soft"}, "delta_kd: found 'soft', expected a finite number"),
-        ({"torque_noise": float("nan")}, "torque_noise: found nan, expected a variance of 0 or more"),
-        ({"torque_limit": [35.0, 0.0, 44.0]}, "torque_limit: found 0.0, expected a torque above 0"),
-        ({"pairs": []}, "pairs: found .*, expected at least one pair"),
+        ({"schema": 2}, "ActuatorParameters.schema: found 2, expected one of 1"),
+        ({"kp_ref": -1}, "ActuatorParameters.kp_ref: found -1.0, expected above 0"),
+        (
+            {"delta_kp": [0.1] * 11},
+            "ActuatorParameters.delta_kp: found .* expected a number, 3 numbers or 12 numbers",
+        ),
+        ({"delta_kd": "soft"}, "delta_kd: found 'soft', expected a number"),
+        ({"torque_noise": float("nan")}, "ActuatorParameters.torque_noise: found nan, expected at least 0"),
+        (
+            {"torque_limit": [35.0, 0.0, 44.0]},
+            r"ActuatorParameters.torque_limit: found .*, expected finite numbers, above 0",
+        ),
+        ({"pairs": []}, "ActuatorParameters.pairs: found .*, expected at least one pair"),
         (
             {"pairs": [{"input_delay_s": -0.1, "output_delay_s": 0, "mse": 1}]},
-            r"pairs\[0\].input_delay_s: found -0.1, expected a delay of 0 s or more",
+            r"pairs\[0\]: DelayPair.input_delay_s: found -0.1, expected at least 0",
         ),
-        ({"pairs": [{"input_delay_s": 0.1, "mse": 1}]}, r"pairs\[0\].output_delay_s: the field is missing"),
-        ({"torque_noise": None}, "torque_noise: the field is missing"),
-        ({"stiffness": 3}, "stiffness: unknown field, expected one of schema, name"),
-        ({"effects": [{"name": "friction", "joints": [], "parameters": {}}]}, r"effects\[0\].joints: found"),
+        (
+            {"pairs": [{"input_delay_s": 0.1, "mse": 1}]},
+            r"pairs\[0\].output_delay_s: found nothing, expected a value",
+        ),
+        ({"torque_noise": None}, "torque_noise: found nothing, expected a value"),
+        ({"stiffness": 3}, "found the field 'stiffness', expected one of schema, name"),
+        (
+            {"effects": [{"name": "friction", "joints": [], "parameters": {}}]},
+            r"effects\[0\]: Effect.joints: found",
+        ),
     ],
 )
 def test_a_wrong_file_is_refused_with_file_field_value_and_expectation(tmp_path, changes, sentence):

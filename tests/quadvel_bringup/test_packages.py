@@ -174,6 +174,17 @@ def test_pip_brings_what_the_sources_import_and_nothing_else() -> None:
     assert requirements(*(extras - set(OF_TOOLS))) - BY_TORCH == from_pip
 
 
+def test_the_full_simulator_is_the_core_of_the_same_version() -> None:
+    core, full = (
+        tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+        for folder in (ROOT, ROOT / "packaging" / "quadvel")
+    )
+    assert full["version"] == core["version"]
+    assert full["dependencies"] == [f"{core['name']}[eval]=={core['version']}"]
+    assert full["requires-python"] == core["requires-python"]
+    assert {"mujoco", "onnxruntime", "matplotlib", "mcap"} <= requirements("eval")
+
+
 @pytest.mark.parametrize("package", [one for one in PACKAGES if one != MESSAGES])
 def test_files_that_are_no_modules_are_installed_by_pip_and_by_ament(package: str) -> None:
     """By pip with the patterns of pyproject.toml, by ament with those of the package's setup.cfg."""
@@ -191,17 +202,6 @@ def test_files_that_are_no_modules_are_installed_by_pip_and_by_ament(package: st
         if file.suffix not in (".md", ".typed"):  # which no program of ROS reads
             assert any(file.match(pattern) for pattern in ament if pattern), f"setup.cfg: {file}"
             assert any(file.match(pattern.removeprefix("**/")) for pattern in pip), f"pyproject.toml: {file}"
-
-
-def test_the_full_simulator_is_the_core_of_the_same_version() -> None:
-    core, full = (
-        tomllib.loads((folder / "pyproject.toml").read_text())["project"]
-        for folder in (ROOT, ROOT / "packaging" / "quadvel")
-    )
-    assert full["version"] == core["version"]
-    assert full["dependencies"] == [f"{core['name']}[eval]=={core['version']}"]
-    assert full["requires-python"] == core["requires-python"]
-    assert {"mujoco", "onnxruntime", "matplotlib", "mcap"} <= requirements("eval")
 
 
 def test_viser_is_held_at_the_minor_version_whose_start_is_known() -> None:

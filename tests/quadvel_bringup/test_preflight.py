@@ -40,7 +40,10 @@ def test_the_shipped_stack_is_in_order() -> None:
             {"world": "moon"},
             "sim_node: world moon: .*, expected a YAML file or one of corridor, park, campus",
         ),
-        ({"estimator": "magic"}, "estimator: kind is 'magic', expected learned or kalman"),
+        (
+            {"estimator": "magic"},
+            "estimator: EstimatorParameters.kind: found 'magic', expected one of learned, kalman",
+        ),
         ({"policy": Path("nowhere.onnx")}, r"controller: .*nowhere\.onnx: no such file"),
         ({"policy": PARAMETERS}, r"controller: .*params\.yaml"),
         (

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from quadvel_description import mjcf, robot
-from quadvel_description.frames import BASE, FOOTPRINT, Placed, fixed_links, footprint, moving_links
+from quadvel_description.frames import BASE, FOOTPRINT, FramePose, fixed_links, footprint, moving_links
 from quadvel_description.kinematics import foot_positions, rotate, yaw
 
 
-def in_base(frames: list[Placed], name: str) -> tuple[np.ndarray, np.ndarray]:
+def in_base(frames: list[FramePose], name: str) -> tuple[np.ndarray, np.ndarray]:
     """Position and rotation matrix of a frame in base_link, up the tree."""
     parents = {frame.child: frame for frame in frames}
     position, rotation = np.zeros(3), np.eye(3)

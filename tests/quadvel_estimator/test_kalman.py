@@ -239,7 +239,7 @@ def test_a_vector_within_the_bounds_makes_a_configuration_and_back() -> None:
 
 
 def test_a_noise_of_zero_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="'foot_position' must be > 0"):
+    with pytest.raises(ValueError, match=r"foot_position: found 0\.0, expected above 0"):
         KalmanConfig(foot_position=0.0)
 
 

@@ -173,8 +173,11 @@ def test_what_is_not_fit_to_use_is_refused_counted_and_named(bench: Bench) -> No
 @pytest.mark.parametrize(
     ("argument", "sentence"),
     [
-        ("kind:=psychic", "parameters: kind is 'psychic', expected learned or kalman"),
-        ("reset_gap:=0.0", "parameters: reset_gap is 0.0, expected a time above 0 s"),
+        (
+            "kind:=psychic",
+            "parameters: EstimatorParameters.kind: found 'psychic', expected one of learned, kalman",
+        ),
+        ("reset_gap:=0.0", "parameters: EstimatorParameters.reset_gap: found 0.0, expected above 0"),
         ("reset_gap:=soon", "parameter reset_gap: "),
         ("speed:=3", "unknown parameter speed, expected one of realtime_priority, cpus, kind, model"),
     ],

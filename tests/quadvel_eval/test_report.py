@@ -13,7 +13,7 @@ from rich.console import Console
 from quadvel_eval.grid import Cell, CellResult, summarise
 from quadvel_eval.report import evaluation_table, write_evaluation, write_json
 from quadvel_eval.segments import Segment
-from quadvel_recordings.output import output_file, output_folder, replacing
+from quadvel_recordings.output import atomic_write, output_file, output_folder
 
 WALKED = CellResult(
     Cell((0.5, 0.0, 0.0), 0),
@@ -65,7 +65,7 @@ def test_a_file_that_is_not_finished_leaves_the_old_one_and_no_draft(tmp_path: P
     (tmp_path / "eval.json").write_text("old")
     with pytest.raises(ValueError, match="JSON"):
         write_json(tmp_path / "eval.json", {"mean_error_xy": float("nan")})
-    with pytest.raises(KeyboardInterrupt), replacing(tmp_path / "eval.json") as draft:  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), atomic_write(tmp_path / "eval.json") as draft:  # noqa: PT012
         draft.write_text("half")
         raise KeyboardInterrupt
     assert [path.name for path in tmp_path.iterdir()] == ["eval.json"]
@@ -91,7 +91,7 @@ def test_a_missing_folder_is_made_with_its_first_file(tmp_path: Path) -> None:
 def test_a_folder_that_was_made_for_a_file_goes_where_the_file_fails(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     for folder in (tmp_path / "a" / "b", tmp_path / "there"):
-        with pytest.raises(KeyboardInterrupt), replacing(folder / "walk.mcap") as draft:  # noqa: PT012
+        with pytest.raises(KeyboardInterrupt), atomic_write(folder / "walk.mcap") as draft:  # noqa: PT012
             draft.write_text("half")
             raise KeyboardInterrupt
     assert list(tmp_path.rglob("*")) == [tmp_path / "there"]

@@ -91,8 +91,8 @@ def test_every_thread_stays_on_the_cores_that_were_chosen() -> None:
 @pytest.mark.parametrize(
     ("parameters", "sentence"),
     [
-        ({"realtime_priority": 100}, "realtime_priority is 100, expected 0 to 99"),
-        ({"realtime_priority": -1}, "realtime_priority is -1, expected 0 to 99"),
+        ({"realtime_priority": 100}, "realtime_priority: found 100, expected a whole number, 0 to 99"),
+        ({"realtime_priority": -1}, "realtime_priority: found -1, expected a whole number, 0 to 99"),
         ({"cpus": "0,9999"}, "cpus is '0,9999', expected some of "),
         ({"cpus": "two"}, "cpus is 'two', expected some of "),
     ],

@@ -57,7 +57,7 @@ def test_each_reaches_the_record_that_it_belongs_to(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
-        ({"mode": "slow"}, "mode is 'slow', expected one of realtime, lockstep, fast"),
+        ({"mode": "slow"}, "mode: found 'slow', expected one of realtime, lockstep, fast"),
         ({"state_rate": 300}, "state_rate is 300 Hz, expected a divisor of 1000, 50 at least"),
         ({"state_rate": 0}, "state_rate is 0 Hz, expected a divisor of 1000, 50 at least"),
         ({"answer_timeout": 0.0}, "answer_timeout is 0.0 s, expected a time above 0"),

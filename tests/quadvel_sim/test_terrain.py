@@ -96,7 +96,7 @@ def test_perlin_noise_vanishes_on_its_lattice_and_is_smooth_between() -> None:
         ({"slope": 0.1}, "Terrain.slope: found 0.1 rad with kind 'flat', expected 0"),
         ({"kind": "slope", "slope": float("nan")}, "Terrain.slope: found nan, expected -0.8 to 0.8"),
         ({"kind": "rough", "roughness": 0.0}, "Terrain.roughness: found 0.0, expected 0.001 to 1"),
-        ({"kind": "rough", "seed": -1}, "Terrain.seed: found -1, expected a whole number of 0 or more"),
+        ({"kind": "rough", "seed": -1}, "Terrain.seed: found -1, expected a whole number, at least 0"),
     ],
 )
 def test_bad_ground_is_refused_by_name(arguments: dict[str, object], sentence: str) -> None:

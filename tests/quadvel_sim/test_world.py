@@ -323,21 +323,21 @@ def test_a_shipped_world_leads_a_person_who_walks_where_nothing_stands(name: str
 
 
 REFUSED = {
-    "no mapping": ([1], r"the file: found \[1\], expected fields"),
+    "no mapping": ([1], r"found \[1\], expected fields"),
     "no schema": ({}, r"schema: found None, expected 1"),
     "unknown part": (
         {"schema": 1, "wals": []},
-        r"the file: found the field 'wals', expected one of name, seed",
+        r"found the field 'wals', expected one of name, seed",
     ),
     "no list": ({"schema": 1, "walls": 3}, r"walls: found 3, expected a list"),
-    "missing field": ({"schema": 1, "walls": [{}]}, r"walls\[0\]: found no field 'points'"),
+    "missing field": ({"schema": 1, "walls": [{}]}, r"walls\[0\]\.points: found nothing"),
     "one point": (
         {"schema": 1, "walls": [{"points": [[1, 2]]}]},
-        r"Wall.points: found shape \(1, 2\), expected 2 or more",
+        r"Wall.points: found .*, expected 2 or more",
     ),
     "a word": (
         {"schema": 1, "boxes": [{"position": [0, 0], "size": [1, 1, 1], "yaw": "north"}]},
-        r"boxes\[0\]: Box.yaw: found north, expected -360 to 360",
+        r"boxes\[0\]\.yaw: found 'north', expected a number",
     ),
     "too steep": (
         {"schema": 1, "hills": [{"position": [9, 0], "size": [8, 8], "height": 0.2, "slope": 16}]},
@@ -362,7 +362,7 @@ REFUSED = {
     "too fast": ({"schema": 1, "laser": {"rate": 50}}, r"Laser.rate: found 50.0, expected 10 to 40"),
     "stops": (
         {"schema": 1, "persons": [{"way": [[0, 1], [2, 3]], "stops": [3]}]},
-        r"persons\[0\]: Person.stops: found \[3\], expected pairs of numbers",
+        r"persons\[0\]\.stops\[0\]: found 3, expected a list",
     ),
     "two led": (
         {"schema": 1, "persons": [{"way": [[0, 1], [2, 3]], "led": True}] * 2},

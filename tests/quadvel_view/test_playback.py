@@ -8,9 +8,9 @@ import pytest
 from mcap.writer import Writer
 
 from quadvel_recordings.reading import RecordingError
+from quadvel_view.page_protocol import Pace, Seek, Stop
 from quadvel_view.playback import Playback
 from quadvel_view.replay import execute
-from quadvel_view.words import Pace, Seek, Stop
 
 from .conftest import SECONDS, SPEED
 

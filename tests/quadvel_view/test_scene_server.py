@@ -18,7 +18,7 @@ from viser._tunnel import ViserTunnel
 from websockets.asyncio.client import unix_connect
 from websockets.typing import Subprotocol
 
-from quadvel_view.guard import is_loopback
+from quadvel_view.access_control import is_loopback
 from quadvel_view.scene_server import SceneServer, SceneServerError, client_page
 from quadvel_view.server import AddressError
 from quadvel_view.viewer import Viewer

@@ -17,8 +17,8 @@ from websockets.exceptions import ConnectionClosed, ConnectionClosedError, Inval
 from websockets.frames import CloseCode
 from websockets.sync.client import connect
 
+from quadvel_view.page_protocol import MAX_MESSAGE_BYTES, LetGo, Stop
 from quadvel_view.server import LOG, MAX_FRAGMENTS, MAX_SOCKETS, AddressError, PageServer
-from quadvel_view.words import MAX_MESSAGE_BYTES, LetGo, Stop
 
 NOWHERE = Path("/nowhere")
 TEXT, CONTINUED, END, MASKED = 1, 0, 0x80, 0x80  # of RFC 6455, 5.2

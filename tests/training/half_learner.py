@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from test_ppo import learner, rollout
 
-from quadvel_training import loop, parallel
+from quadvel_training import loop, process_group
 from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun
 
 
@@ -42,11 +42,11 @@ def run(checkpoint: Path) -> tuple[dict[str, torch.Tensor], np.ndarray, np.ndarr
 
 
 if __name__ == "__main__":
-    parallel.join("cpu")
+    process_group.join("cpu")
     update(slice(4, 8))
-    parallel.gather(run(Path(sys.argv[1])))
-    assert parallel.broadcast("second") == "first"
-    assert parallel.gather("second") == ["first", "second"]
-    parallel.destroy_group()
+    process_group.gather(run(Path(sys.argv[1])))
+    assert process_group.broadcast("second") == "first"
+    assert process_group.gather("second") == ["first", "second"]
+    process_group.destroy_group()
     names = [(thread / "comm").read_text() for thread in Path("/proc/self/task").iterdir()]
     assert not any("gloo" in name for name in names), names

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_description import robot, symmetry  # noqa: E402
 from quadvel_sim.terrain import Terrain  # noqa: E402
-from quadvel_training import loop, parallel, privileged  # noqa: E402
+from quadvel_training import loop, privileged, process_group  # noqa: E402
 from quadvel_training.command_grid import CELL_WIDTH, INITIAL_REACH, CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.privileged import (  # noqa: E402
@@ -274,10 +274,10 @@ def test_the_grid_hears_how_robots_of_all_processes_followed(monkeypatch, grid):
     for _ in range(100):
         other.advance(np.zeros((2, 3)), 0.02)
     other.finish(command, np.ones(2, bool), fell)
-    monkeypatch.setattr(parallel, "gather", lambda own: [own, other._over])
+    monkeypatch.setattr(process_group, "gather", lambda own: [own, other._over])
     mine.report_to(grid)
     assert grid.success[grid.cell_of(command[0, :3])] > 0.0
-    monkeypatch.setattr(parallel, "gather", lambda own: [own])
+    monkeypatch.setattr(process_group, "gather", lambda own: [own])
     other.report_to(again := CommandGrid(GridConfig()))
     assert np.array_equal(again.success, grid.success)
     other.report_to(fresh := CommandGrid(GridConfig()))

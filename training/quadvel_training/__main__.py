@@ -30,8 +30,8 @@ from . import (
     leg_classifier,
     limiting,
     loop,
-    parallel,
     privileged,
+    process_group,
     recipe,
     run_folder,
     stages,
@@ -78,7 +78,7 @@ def _configured(kind: type[Any], source: Path | None, minutes: float | None) -> 
 
 def _written(*paths: Path) -> None:
     """Print the written files, in the process that wrote them."""
-    if parallel.rank() == 0:
+    if process_group.rank() == 0:
         print("written:", *paths)
 
 

@@ -21,7 +21,7 @@ from quadvel_description import symmetry
 from quadvel_policy.observation import DEFAULT_OBSERVATION
 from quadvel_sim.terrain import Terrain
 
-from . import dagger, parallel, privileged
+from . import dagger, privileged, process_group
 from .command_grid import CommandGrid, GridConfig
 from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, TimeShares, linear, load
@@ -120,8 +120,8 @@ class ConstrainedRun:
             teacher: checkpoint of `privileged`; None for no pull.
             device: where networks are, `cpu` or `cuda`.
         """
-        self.device = parallel.join(device)
-        self.config = c = attrs.evolve(config, n=parallel.local_share(config.n))
+        self.device = process_group.join(device)
+        self.config = c = attrs.evolve(config, n=process_group.local_share(config.n))
         torch.manual_seed(c.seed)
         known = load(start) if start else {}
         self.grid = CommandGrid(c.grid)
@@ -130,7 +130,7 @@ class ConstrainedRun:
         env_config = EnvConfig(
             n=c.n,
             threads=c.threads,
-            seed=parallel.process_seed(c.seed),
+            seed=process_group.process_seed(c.seed),
             timestep=c.timestep,
             actuator=load_actuator(c.actuator),
             terrain=c.terrain,
@@ -220,7 +220,7 @@ class ConstrainedRun:
         self.ppo.restore(state["learner"])
         self.grid.restore(state["grid"])
         self.samples, self.updates = state["samples"], state["updates"]
-        parallel.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
+        process_group.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
 
     def step(self, done: float) -> dict[str, float]:
@@ -314,7 +314,7 @@ class ConstrainedRun:
             self.scorer.finish(command, (fell | late | env.changed) & alive, fell)
             alive &= ~(fell | late)
         self.scorer.report_to(self.grid)
-        self.samples += c.length * c.n * parallel.size()
+        self.samples += c.length * c.n * process_group.size()
         rows = {name: np.array(value, dtype=np.float32) for name, value in keep.items()}
         rows |= {"noise": before, "spread": self._spread, "last_critic_obs": self.critic_obs()}
         t = {name: torch.from_numpy(value).to(self.device) for name, value in rows.items()}

@@ -31,7 +31,7 @@ from quadvel_policy.observation import (
 )
 from quadvel_sim.terrain import Terrain
 
-from . import parallel, privileged
+from . import privileged, process_group
 from .command_grid import CommandGrid, GridConfig
 from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, CheckpointError, cosine, linear, load, set_rate
@@ -164,8 +164,8 @@ class DaggerRun:
             config: configuration.
             teacher_file: checkpoint of `privileged`.
         """
-        parallel.join("cpu")
-        self.config = c = attrs.evolve(config, n=parallel.local_share(config.n))
+        process_group.join("cpu")
+        self.config = c = attrs.evolve(config, n=process_group.local_share(config.n))
         torch.manual_seed(c.seed)
         checkpoint = load(teacher_file)
         self.grid = CommandGrid(c.grid)
@@ -173,7 +173,7 @@ class DaggerRun:
         env_config = EnvConfig(
             n=c.n,
             threads=c.threads,
-            seed=parallel.process_seed(c.seed),
+            seed=process_group.process_seed(c.seed),
             timestep=c.timestep,
             actuator=load_actuator(c.actuator),
             terrain=c.terrain,
@@ -215,7 +215,7 @@ class DaggerRun:
         self.student.load_state_dict(state["student"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.samples = state["samples"]
-        parallel.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
+        process_group.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
 
     def _share(self) -> float:
@@ -292,7 +292,7 @@ class DaggerRun:
             fell |= env.fallen & alive
             alive &= ~(env.fallen | env.timed_out)
         masks[-1] = alive  # robots that end in the last tick count as ended, too
-        self.samples += c.length * c.n * parallel.size()
+        self.samples += c.length * c.n * process_group.size()
         obs_t, label_t, mask_t = (
             torch.from_numpy(np.array(x, dtype=np.float32)) for x in (observations, labels, masks)
         )
@@ -332,7 +332,7 @@ class DaggerRun:
             loss = masked_mean(error.mean(-1), mask[:, ids])
             self.optimiser.zero_grad()
             loss.backward()
-            parallel.share_gradients(self.student)
+            process_group.share_gradients(self.student)
             torch.nn.utils.clip_grad_norm_(self.student.parameters(), 1.0)
             self.optimiser.step()
             total += float(loss.detach())

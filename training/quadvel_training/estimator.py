@@ -21,7 +21,7 @@ from quadvel_description.robot import GRAVITY
 from quadvel_estimator import features
 from quadvel_sim.terrain import Terrain
 
-from . import parallel
+from . import process_group
 from .env import TICK_S, CommandRange
 from .loop import Budget, cosine, set_rate
 from .networks import Recurrent, State, select
@@ -254,8 +254,8 @@ class EstimatorRun:
             config: configuration.
             actor: policy of the walks.
         """
-        parallel.join("cpu")
-        self.config = config = attrs.evolve(config, n=parallel.local_share(config.n))
+        process_group.join("cpu")
+        self.config = config = attrs.evolve(config, n=process_group.local_share(config.n))
         torch.manual_seed(config.seed)
         self.network = VelocityNetwork()
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
@@ -264,7 +264,7 @@ class EstimatorRun:
             EstimatedWalks(walks, self.network)
             for walks in walks_on_both_grounds(
                 config.n,
-                parallel.process_seed(config.seed),
+                process_group.process_seed(config.seed),
                 config.commands,
                 config.randomisation,
                 config.rough,
@@ -326,7 +326,7 @@ class EstimatorRun:
                     seen[name] += value / (c.mini_batches * c.epochs)
         for walk in self.walks:
             walk.start_over(c.forget)
-        self.samples += c.length * c.n * parallel.size()
+        self.samples += c.length * c.n * process_group.size()
         return {"flat": seen["flat"] ** 0.5, "rough": seen["rough"] ** 0.5, "nll": seen["nll"]}
 
     def _learn(self, ids: torch.Tensor, data: list[Sequence], remember: bool) -> dict[str, float]:
@@ -342,7 +342,7 @@ class EstimatorRun:
         loss = torch.stack(losses).mean()
         self.optimiser.zero_grad()
         loss.backward()
-        parallel.share_gradients(self.network)
+        process_group.share_gradients(self.network)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimiser.step()
         return {"flat": squares[0], "rough": squares[1], "nll": float(likelihood.detach())}

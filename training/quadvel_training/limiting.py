@@ -11,7 +11,7 @@ from quadvel_description.onnx_format import message, serialise
 from quadvel_description.recurrent_network import METADATA_KEY
 from quadvel_policy.observation import COMMAND_AXES, VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
-from quadvel_recordings.output import replacing
+from quadvel_recordings.output import atomic_write
 
 
 def limit_commands(policy: Path, limits: VelocityCommandLimits) -> None:
@@ -38,5 +38,5 @@ def limit_commands(policy: Path, limits: VelocityCommandLimits) -> None:
     model = read_network(policy)
     text = message("StringStringEntryProto", key=METADATA_KEY, value=narrowed.to_json())
     model.fields["metadata_props"] = [text]
-    with replacing(policy) as draft:
+    with atomic_write(policy) as draft:
         draft.write_bytes(serialise(model))

@@ -16,7 +16,7 @@ import torch
 from rich.progress import Progress, TextColumn
 from torch.utils.tensorboard import SummaryWriter
 
-from . import parallel
+from . import process_group
 
 SAVE_INTERVAL_S = 60.0
 
@@ -258,16 +258,18 @@ def train(run: Run, budget: Budget, checkpoint: Path, keeper: Keeper | None = No
         Whether the budget is spent.
     """
     known = load(checkpoint) if checkpoint.exists() else {}
-    if known or parallel.size() > 1:
-        run.restore(parallel.broadcast(known or run.state()))
-    journal = _Journal(run, checkpoint, keeper, known.get("seconds", 0.0)) if parallel.rank() == 0 else None
+    if known or process_group.size() > 1:
+        run.restore(process_group.broadcast(known or run.state()))
+    journal = (
+        _Journal(run, checkpoint, keeper, known.get("seconds", 0.0)) if process_group.rank() == 0 else None
+    )
     started, done, stopped = time.monotonic(), 0.0, False
     try:
         with Interrupt() as interrupt:
             while True:
                 minutes = (time.monotonic() - started) / 60
                 done = max(run.samples / budget.samples, minutes / budget.minutes)
-                done, stopped = parallel.broadcast((done, interrupt.requested))
+                done, stopped = process_group.broadcast((done, interrupt.requested))
                 if stopped or done >= 1.0:
                     break
                 seen = run.step(done)
@@ -280,7 +282,7 @@ def train(run: Run, budget: Budget, checkpoint: Path, keeper: Keeper | None = No
         journal.save()
         if stopped:
             print("stopped; everything so far is in the checkpoint")
-    parallel.broadcast(None)  # wait until everything is written
+    process_group.broadcast(None)  # wait until everything is written
     return bool(done >= 1.0)
 
 

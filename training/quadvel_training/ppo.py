@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from . import parallel
+from . import process_group
 from .loop import set_rate
 from .networks import Gaussian, State, select
 
@@ -144,7 +144,7 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     Returns:
         A number whose mean over the processes is the mean over all samples; so are its gradients.
     """
-    return (values * mask).sum() / parallel.mean(mask.sum()).clamp(min=1)
+    return (values * mask).sum() / process_group.mean(mask.sum()).clamp(min=1)
 
 
 def exploration_scales(n: int) -> np.ndarray:
@@ -279,8 +279,8 @@ class Ppo:
         # Normalise over all processes; the bound keeps one fall from dominating the update:
         #     A <- clamp((A - mean(A)) / std(A), +-ADVANTAGE_BOUND)
         explained = 1 - masked_mean(advantage**2, r.mask) / target[r.mask > 0].var().clamp(min=1e-8)
-        centre = parallel.mean(masked_mean(advantage, r.mask))
-        spread = parallel.mean(masked_mean((advantage - centre) ** 2, r.mask)).sqrt()
+        centre = process_group.mean(masked_mean(advantage, r.mask))
+        spread = process_group.mean(masked_mean((advantage - centre) ** 2, r.mask)).sqrt()
         advantage = ((advantage - centre) / (spread + 1e-6)).clamp(-ADVANTAGE_BOUND, ADVANTAGE_BOUND)
         with torch.no_grad():
             old_log_prob = self._log_prob(r, slice(None), r.mean)
@@ -385,14 +385,14 @@ class Ppo:
         # KL divergence of two Gaussians with one variance: |mu - mu_old|^2 / (2 sigma^2)
         if c.target_kl is not None:
             shift = ((mean.detach() - r.mean[:, ids]) ** 2 / (2 * variance)).sum(-1)
-            terms["kl"] = parallel.mean(masked_mean(shift, mask))
+            terms["kl"] = process_group.mean(masked_mean(shift, mask))
         return {name: float(term.detach()) for name, term in terms.items()}
 
     def _step(self, optimiser: torch.optim.Optimizer, module: torch.nn.Module, loss: Tensor) -> None:
         """Take an optimiser step with the mean gradient of all processes, clipped in norm."""
         optimiser.zero_grad()
         loss.backward()
-        parallel.share_gradients(module)
+        process_group.share_gradients(module)
         norm = torch.nn.utils.clip_grad_norm_(module.parameters(), self.config.max_grad_norm)
         if not torch.isfinite(norm):
             raise FloatingPointError(

@@ -21,7 +21,7 @@ from quadvel_description import robot, symmetry
 from quadvel_description.symmetry import Mirror
 from quadvel_sim.terrain import Terrain
 
-from . import loop, parallel
+from . import loop, process_group
 from .command_grid import CommandGrid, GridConfig
 from .env import EnvConfig, VelocityEnv, available_cores
 from .loop import Budget
@@ -326,7 +326,7 @@ class CommandScorer:
         Args:
             grid: command grid of this process.
         """
-        for judged in itertools.chain(*parallel.gather(self._over)):
+        for judged in itertools.chain(*process_group.gather(self._over)):
             grid.record(*judged)
         self._over = []
 
@@ -340,14 +340,14 @@ class PrivilegedRun:
         Args:
             config: configuration.
         """
-        parallel.join("cpu")
-        self.config = c = attrs.evolve(config, n=parallel.local_share(config.n))
+        process_group.join("cpu")
+        self.config = c = attrs.evolve(config, n=process_group.local_share(config.n))
         torch.manual_seed(c.seed)
         self.grid = CommandGrid(c.grid)
         env_config = EnvConfig(
             n=c.n,
             threads=c.threads,
-            seed=parallel.process_seed(c.seed),
+            seed=process_group.process_seed(c.seed),
             period=SAMPLE_S,
             timestep=c.timestep,
             actuator=load_actuator(c.actuator),
@@ -405,7 +405,7 @@ class PrivilegedRun:
         self.grid.restore(state["grid"])
         self.samples = state["samples"]
         self._update_airborne_share(state["airborne"], 1.0)
-        parallel.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
+        process_group.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
 
     def step(self, done: float) -> dict[str, float]:
@@ -498,9 +498,9 @@ class PrivilegedRun:
             self.scorer.finish(command, fell | late | env.changed, fell)
             self._start_over(np.flatnonzero(fell | late))
         self.scorer.report_to(self.grid)
-        airborne = float(np.mean(parallel.gather(seen[5] / max(walking, 1))))
+        airborne = float(np.mean(process_group.gather(seen[5] / max(walking, 1))))
         self._update_airborne_share(airborne)
-        self.samples += c.length * c.n * parallel.size()
+        self.samples += c.length * c.n * process_group.size()
         t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
         last = self._critic_obs(observe(env, self.past, self._actions[0]))
         rollout = Rollout(

@@ -10,8 +10,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import cattrs
-import yaml
+import attrs
+
+from quadvel_description.bounded_yaml import read_yaml
+from quadvel_description.records import structure_record
 
 BASE = "base"
 
@@ -34,12 +36,12 @@ def read_recipe(kind: type[Any], path: Path | None) -> Any:
         RecipeError: a field is unknown or has a wrong value.
         FileNotFoundError: a file is missing.
     """
-    converter = cattrs.Converter(forbid_extra_keys=True)
     try:
         fields = read_fields(path) if path else {}
-        return converter.structure(_merged(cattrs.unstructure(kind()), fields), kind)
-    except cattrs.BaseValidationError as error:
-        raise RecipeError(f"{path}: " + "; ".join(cattrs.transform_error(error))) from None
+        record = structure_record(kind, _merged(attrs.asdict(kind()), fields), path)
+    except ValueError as error:
+        raise RecipeError(str(error)) from None
+    return record
 
 
 def read_fields(path: Path) -> dict[str, Any]:
@@ -54,7 +56,7 @@ def read_fields(path: Path) -> dict[str, Any]:
     Raises:
         RecipeError: the file holds no mapping.
     """
-    fields = yaml.safe_load(path.read_text()) or {}
+    fields = read_yaml(path, "a recipe") or {}
     if not isinstance(fields, dict):
         raise RecipeError(f"{path}: found {fields!r}, expected fields and their values")
     base = fields.pop(BASE, None)

@@ -17,7 +17,7 @@ from quadvel_eval.pool import Call, run_in_parallel
 from quadvel_eval.report import write_json
 from quadvel_eval.walk import Setup
 
-from . import loop, parallel
+from . import loop, process_group
 from .constrained import ConstrainedRun
 from .onnx_file import commit
 from .randomisation import ACTUATORS, load_actuator
@@ -34,7 +34,7 @@ def write_run_file(folder: Path, stage: str, recipe: Path | None, config: Any) -
         recipe: recipe file, if any.
         config: configuration, an attrs instance.
     """
-    if parallel.rank() > 0:
+    if process_group.rank() > 0:
         return
     folder.mkdir(parents=True, exist_ok=True)
     about = {"stage": stage, "recipe": recipe.stem if recipe else None, "commit": commit()}

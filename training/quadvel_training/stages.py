@@ -10,7 +10,7 @@ from typing import Any
 
 import attrs
 
-from . import loop, parallel, recipe
+from . import loop, process_group, recipe
 from .constrained import ConstrainedConfig, ConstrainedRun
 from .dagger import DaggerConfig, DaggerRun, export_policy, load_policy
 from .estimator import EstimatorConfig, EstimatorRun
@@ -64,7 +64,7 @@ def train_student(config: DaggerConfig, source: Path | None, teacher: Path, fold
     run, checkpoint = DaggerRun(config, teacher), folder / STUDENT
     write_run_file(folder, "dagger", source, config)
     spent = loop.train(run, config.budget, checkpoint)
-    if parallel.rank() == 0:
+    if process_group.rank() == 0:
         about = training_record("dagger", source, config, checkpoint)
         export_policy(run.student, run.env, config.grid.answered, folder / POLICY_FILE, about)
     return spent
@@ -94,7 +94,7 @@ def train_policy(
     run, checkpoint = ConstrainedRun(config, start, teacher, device), folder / POLICY
     write_run_file(folder, "constrained", source, config)
     spent = loop.train(run, config.budget, checkpoint, EvaluatedPolicies(run, folder))
-    if parallel.rank() == 0:
+    if process_group.rank() == 0:
         run.write_policy(folder / POLICY_FILE, training_record("constrained", source, config, checkpoint))
     return spent
 
@@ -114,7 +114,7 @@ def train_estimator(config: EstimatorConfig, source: Path | None, policy: Path, 
     run, checkpoint = EstimatorRun(config, load_policy(policy)), folder / ESTIMATOR
     write_run_file(folder, "estimator", source, config)
     spent = loop.train(run, config.budget, checkpoint)
-    if parallel.rank() == 0:
+    if process_group.rank() == 0:
         run.export(folder / ESTIMATOR_FILE, training_record("estimator", source, config, checkpoint))
     return spent
 

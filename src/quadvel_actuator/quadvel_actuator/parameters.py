@@ -6,7 +6,7 @@ Table 4 of the paper.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ import numpy as np
 import yaml
 
 from quadvel_description.bounded_yaml import read_yaml
+from quadvel_description.fields import Numbers, field, refusal
+from quadvel_description.records import structure_record
 
 SCHEMA = 1
 DEFAULT_JOINT_COUNT = 12
@@ -34,50 +36,9 @@ _COMMENTS = {
 }
 
 
-def _is_number(value: Any) -> bool:
-    """Whether a value is a finite int or float; booleans are not numbers here."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
-
-
-def _raise_invalid(field: str, value: Any, expected: str) -> None:
-    """Raise a ValueError that names the field, the value found and the expected one."""
-    raise ValueError(f"{field}: found {value!r}, expected {expected}")
-
-
-def _number(expected: str, at_least: float = -np.inf, above: float = -np.inf) -> Any:
-    """Build a validator for a finite number that is at least `at_least` and above `above`."""
-
-    def check(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
-        if not _is_number(value) or value < at_least or value <= above:
-            _raise_invalid(attribute.name, value, expected)
-
-    return check
-
-
-def _per_joint(expected: str, above: float = -np.inf) -> Any:
-    """Build a validator for 1, 3 (hip, thigh, calf) or one number per joint, above a bound."""
-
-    def check(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
-        values = list(value) if isinstance(value, tuple) else [value]
-        joints = len(instance.joints) or DEFAULT_JOINT_COUNT
-        if isinstance(value, tuple) and len(value) not in (3, joints):
-            _raise_invalid(attribute.name, value, f"a number, 3 numbers or {joints} numbers")
-        for one in values:
-            if not _is_number(one) or one <= above:
-                _raise_invalid(attribute.name, one, expected)
-
-    return check
-
-
-def _text(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
-    """Validate a string that is not empty."""
-    if not isinstance(value, str) or not value:
-        _raise_invalid(attribute.name, value, "a name")
-
-
-def _tuple_if_list(value: Any) -> Any:
-    """Convert lists, which YAML gives, to tuples."""
-    return tuple(value) if isinstance(value, list) else value
+def _to_tuple(values: Iterable[Any]) -> tuple[Any, ...]:
+    """Convert any sequence to a tuple."""
+    return tuple(values)
 
 
 @attrs.frozen
@@ -90,21 +51,9 @@ class DelayPair:
         mse: N^2 m^2, mean squared torque error of a model with these delays.
     """
 
-    input_delay_s: float = attrs.field(validator=_number("a delay of 0 s or more", at_least=0.0))
-    output_delay_s: float = attrs.field(validator=_number("a delay of 0 s or more", at_least=0.0))
-    mse: float = attrs.field(validator=_number("an error of 0 or more", at_least=0.0))
-
-
-def _mapping(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
-    """Validate a mapping."""
-    if not isinstance(value, Mapping):
-        _raise_invalid(attribute.name, value, "a mapping from parameter names")
-
-
-def _names(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
-    """Validate a tuple of joint names that is not empty."""
-    if not isinstance(value, tuple) or not value or not all(isinstance(name, str) for name in value):
-        _raise_invalid(attribute.name, value, "a list of joint names")
+    input_delay_s: float = field(at_least=0.0)
+    output_delay_s: float = field(at_least=0.0)
+    mse: float = field(at_least=0.0)
 
 
 @attrs.frozen
@@ -121,69 +70,18 @@ class Effect:
             draws from them.
     """
 
-    name: str = attrs.field(validator=_text)
-    joints: tuple[str, ...] = attrs.field(converter=_tuple_if_list, validator=_names)
-    parameters: Mapping[str, Any] = attrs.field(validator=_mapping)
-    units: Mapping[str, str] = attrs.field(factory=dict, validator=_mapping)
-    intervals: Mapping[str, Any] = attrs.field(factory=dict, validator=_mapping)
+    name: str
+    joints: tuple[str, ...] = attrs.field(converter=_to_tuple)
+    parameters: Mapping[str, Any]
+    units: Mapping[str, str] = attrs.field(factory=dict)
+    intervals: Mapping[str, Any] = attrs.field(factory=dict)
+
+    def __attrs_post_init__(self) -> None:
+        if not self.joints:
+            raise refusal(self, "joints", self.joints, "names of joints")
 
 
-def _names_or_none(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
-    """Validate a tuple of joint names, which may be empty."""
-    if value != ():
-        _names(instance, attribute, value)
-
-
-def _build_record(cls: Any, values: Any) -> Any:
-    """Build an instance of the attrs class `cls` from a mapping with exactly its fields."""
-    if not isinstance(values, Mapping):
-        raise ValueError(f"found {values!r}, expected a mapping")
-    fields = attrs.fields_dict(cls)
-    unknown = [key for key in values if key not in fields]
-    if unknown:
-        raise ValueError(f"{unknown[0]}: unknown field, expected one of {', '.join(fields)}")
-    missing = [key for key, field in fields.items() if field.default is attrs.NOTHING and key not in values]
-    if missing:
-        raise ValueError(f"{missing[0]}: the field is missing")
-    return cls(**values)
-
-
-def _build_records(field: str, cls: Any, values: Any) -> tuple[Any, ...]:
-    """Build a tuple of instances of `cls` from a list of mappings or of instances."""
-    if not isinstance(values, (list, tuple)):
-        raise ValueError(f"{field}: found {values!r}, expected a list")
-    records = []
-    for number, value in enumerate(values):
-        try:
-            records.append(value if isinstance(value, cls) else _build_record(cls, value))
-        except ValueError as error:
-            raise ValueError(f"{field}[{number}].{error}") from None
-    return tuple(records)
-
-
-def _pairs(values: Any) -> tuple[DelayPair, ...]:
-    """Convert the list of delay pairs of a file."""
-    return _build_records("pairs", DelayPair, values)
-
-
-def _effects(values: Any) -> tuple[Effect, ...]:
-    """Convert the list of effects of a file."""
-    return _build_records("effects", Effect, values)
-
-
-def _not_empty(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
-    """Validate a list with at least one pair."""
-    if not value:
-        _raise_invalid(attribute.name, value, "at least one pair")
-
-
-def _known_schema(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
-    """Validate the version of the file format."""
-    if value != SCHEMA or isinstance(value, bool):
-        _raise_invalid(attribute.name, value, str(SCHEMA))
-
-
-@attrs.frozen
+@attrs.frozen(kw_only=True)
 class ActuatorParameters:
     """Parameters of the empirical actuator model (Eq. 1 and 2 of the paper), in SI units.
 
@@ -205,23 +103,26 @@ class ActuatorParameters:
         joints: joint names in order; empty for those of the AlienGo.
     """
 
-    schema: int = attrs.field(validator=_known_schema)
-    name: str = attrs.field(validator=_text)
-    kp_ref: float = attrs.field(validator=_number("a gain above 0", above=0.0))
-    kd_ref: float = attrs.field(validator=_number("a gain above 0", above=0.0))
-    delta_kp: float | tuple[float, ...] = attrs.field(
-        converter=_tuple_if_list, validator=_per_joint("a finite number")
-    )
-    delta_kd: float | tuple[float, ...] = attrs.field(
-        converter=_tuple_if_list, validator=_per_joint("a finite number")
-    )
-    pairs: tuple[DelayPair, ...] = attrs.field(converter=_pairs, validator=_not_empty)
-    torque_noise: float = attrs.field(validator=_number("a variance of 0 or more", at_least=0.0))
-    torque_limit: float | tuple[float, ...] = attrs.field(
-        converter=_tuple_if_list, validator=_per_joint("a torque above 0", above=0.0)
-    )
-    effects: tuple[Effect, ...] = attrs.field(converter=_effects, default=())
-    joints: tuple[str, ...] = attrs.field(converter=_tuple_if_list, validator=_names_or_none, default=())
+    schema: int = field(one_of=(SCHEMA,), whole=True)
+    name: str
+    kp_ref: float = field(above=0.0)
+    kd_ref: float = field(above=0.0)
+    delta_kp: Numbers = field(at_least=-np.inf)
+    delta_kd: Numbers = field(at_least=-np.inf)
+    pairs: tuple[DelayPair, ...] = attrs.field(converter=_to_tuple)
+    torque_noise: float = field(at_least=0.0)
+    torque_limit: Numbers = field(above=0.0)
+    effects: tuple[Effect, ...] = attrs.field(converter=_to_tuple, default=())
+    joints: tuple[str, ...] = attrs.field(converter=_to_tuple, default=())
+
+    def __attrs_post_init__(self) -> None:
+        joint_count = len(self.joints) or DEFAULT_JOINT_COUNT
+        for name in ("delta_kp", "delta_kd", "torque_limit"):
+            value = getattr(self, name)
+            if isinstance(value, tuple) and len(value) not in (3, joint_count):
+                raise refusal(self, name, value, f"a number, 3 numbers or {joint_count} numbers")
+        if not self.pairs:
+            raise refusal(self, "pairs", self.pairs, "at least one pair")
 
     @property
     def best_pair(self) -> DelayPair:
@@ -251,11 +152,7 @@ class ActuatorParameters:
                 the value found and the expected one.
         """
         content = read_yaml(Path(path), "a YAML file of actuator parameters")
-        try:
-            parameters: ActuatorParameters = _build_record(cls, content)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
-        return parameters
+        return structure_record(cls, content, Path(path))
 
     def save(self, path: str | Path) -> None:
         """Write the parameters as YAML with units in comments; `load` is the inverse.

@@ -15,7 +15,7 @@ from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import RobotState
 from quadvel_driver.find_calibration import CalibrationDataError, CalibrationFit, Samples, fit_calibration
 from quadvel_nodes.messages import read_low_state
-from quadvel_recordings.output import output_file, replacing
+from quadvel_recordings.output import atomic_write, output_file
 from quadvel_recordings.reading import read_messages
 
 TOPIC = "/low_state"
@@ -73,7 +73,7 @@ def calibrate_command(
         console.print(
             f"[yellow]the standing feet are {uneven} off a common plane: check the floor and the joints"
         )
-    with replacing(out) as draft:
+    with atomic_write(out) as draft:
         draft.write_text(found.calibration.to_yaml())
     console.print(f"written to {out}", highlight=False)
 

@@ -60,8 +60,8 @@ def _robot() -> Finding:
     """Check for a running robot and its actuator model."""
     try:
         quadvel_dds.install()
+        from .discovery_hint import discovery_hint
         from .status import FILE_KEYS, running_nodes
-        from .whereabouts import discovery_hint
     except ImportError as error:
         return Finding("robot", True, f"not checked: {error}")
     nodes = running_nodes()

@@ -19,8 +19,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from quadvel_nodes.topic_types import all_conflicts
 
+from .discovery_hint import discovery_hint
 from .nodes import enclave
-from .whereabouts import discovery_hint
 
 DISCOVERY_TIMEOUT_S = 4.0
 """Time to discover a peer.

@@ -19,11 +19,11 @@ from quadvel_msgs.msg import ControllerState, LowState, VelocityCommand
 from quadvel_nodes.number_text import number_text
 from quadvel_nodes.topic_types import all_conflicts
 
+from .discovery_hint import discovery_hint
 from .drive import twist_to_array, velocity_text
 from .exclusivity import ros_domain
 from .operator_commands import RECOVERY_HINT
 from .session import DISCOVERY_TIMEOUT_S, Session
-from .whereabouts import discovery_hint
 
 LISTEN_TIME_S = 2.2
 """Minimum time to listen; each node reports once a second."""

@@ -29,7 +29,7 @@ _AXES = np.array([{"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0)}[link.axis] for li
 
 
 @attrs.frozen
-class Placed:
+class FramePose:
     """Pose of a frame in its parent frame.
 
     Attributes:
@@ -45,17 +45,17 @@ class Placed:
     quaternion: Array
 
 
-def fixed_links() -> list[Placed]:
+def fixed_links() -> list[FramePose]:
     """Return the poses of the links that never move in their parents.
 
     Returns:
         Poses, the trunk in `base_link` first.
     """
     links = [link for link in robot.LINKS if not link.axis]
-    return [Placed(link.parent or BASE, link.name, np.array(link.origin), _IDENTITY) for link in links]
+    return [FramePose(link.parent or BASE, link.name, np.array(link.origin), _IDENTITY) for link in links]
 
 
-def moving_links(q: Array) -> list[Placed]:
+def moving_links(q: Array) -> list[FramePose]:
     """Compute the poses of hips, thighs and calves in their parent links.
 
     Args:
@@ -66,12 +66,12 @@ def moving_links(q: Array) -> list[Placed]:
     """
     quaternions = np.column_stack([np.cos(0.5 * q), np.sin(0.5 * q)[:, None] * _AXES])
     return [
-        Placed(str(link.parent), link.name, np.array(link.origin), quaternion)
+        FramePose(str(link.parent), link.name, np.array(link.origin), quaternion)
         for link, quaternion in zip(_MOVING, quaternions, strict=True)
     ]
 
 
-def footprint(q: Array, quaternion: Array) -> Placed:
+def footprint(q: Array, quaternion: Array) -> FramePose:
     """Compute the pose of `base_footprint` in `base_link`.
 
     It lies below the robot on a level floor that the lowest foot touches, and has the robot's
@@ -91,4 +91,4 @@ def footprint(q: Array, quaternion: Array) -> Placed:
     tilt = np.array([c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w])
     floor = rotate(tilt, foot_positions(q))[..., 2].min() - robot.FOOT_RADIUS
     below = rotate_inverse(tilt, np.array([0.0, 0.0, floor]))
-    return Placed(BASE, FOOTPRINT, below, tilt * [1.0, -1.0, -1.0, -1.0])
+    return FramePose(BASE, FOOTPRINT, below, tilt * [1.0, -1.0, -1.0, -1.0])

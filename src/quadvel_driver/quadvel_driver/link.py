@@ -14,12 +14,11 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
 
 import attrs
 import numpy as np
-from attrs.validators import ge, gt, le
 
+from quadvel_description.fields import field
 from quadvel_description.robot import COMMAND_LOWER, COMMAND_UPPER, TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_nodes.messages import QUATERNION_TOLERANCE
@@ -44,10 +43,6 @@ class LinkError(ValueError):
     """A link cannot be opened; the text is the reason, in one sentence."""
 
 
-def _setting(default: Any, description: str, *validators: Any) -> Any:
-    return attrs.field(default=default, validator=list(validators), metadata={"description": description})
-
-
 @attrs.frozen(kw_only=True, slots=False)  # for multiple inheritance
 class LinkConfig:
     """Network addresses and braking of the link.
@@ -65,17 +60,21 @@ class LinkConfig:
         ValueError: A number is out of range; raised by the constructor.
     """
 
-    board_address: str = _setting("192.168.123.10", "IP address of the robot's board")
-    board_port: int = _setting(8007, "UDP port of the board", ge(1), le(65535))
-    local_address: str = _setting("", "own IP address to use; empty: the one that reaches the board")
-    local_port: int = _setting(
-        8082, "own UDP port, to which the board answers; 0: any that is free", ge(0), le(65535)
+    board_address: str = field("192.168.123.10", "IP address of the robot's board")
+    board_port: int = field(8007, "UDP port of the board", at_least=1, at_most=65535, whole=True)
+    local_address: str = field("", "own IP address to use; empty: the one that reaches the board")
+    local_port: int = field(
+        8082,
+        "own UDP port, to which the board answers; 0: any that is free",
+        at_least=0,
+        at_most=65535,
+        whole=True,
     )
-    interface: str = _setting("", "network interface to use alone, such as eth0; empty: any")
-    command_timeout: float = _setting(
-        0.02, "s without a new low_cmd after which the driver brakes the joints", gt(0.0), le(0.5)
+    interface: str = field("", "network interface to use alone, such as eth0; empty: any")
+    command_timeout: float = field(
+        0.02, "s without a new low_cmd after which the driver brakes the joints", above=0.0, at_most=0.5
     )
-    damping_kd: float = _setting(5.0, "gain with which it brakes them, N m s/rad", gt(0.0), le(20.0))
+    damping_kd: float = field(5.0, "gain with which it brakes them, N m s/rad", above=0.0, at_most=20.0)
 
     @property
     def board(self) -> tuple[str, int]:

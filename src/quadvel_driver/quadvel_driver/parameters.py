@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import attrs
 
+from quadvel_description.fields import field
 from quadvel_nodes.scheduling import Scheduling
 
 from .calibration import Calibration
@@ -23,22 +24,15 @@ class DriverParameters(LinkConfig, RemoteConfig, Scheduling):
         dry_run: Whether to show packets instead of sending them.
     """
 
-    state_rate: int = attrs.field(
-        default=200,
-        metadata={"description": "rate of low_state, Hz, up to 1000; the board's own is the highest"},
+    state_rate: int = field(
+        200,
+        "rate of low_state, Hz, up to 1000; the board's own is the highest",
+        at_least=50,
+        at_most=MAX_STATE_RATE_HZ,
+        whole=True,
     )
-    calibration: str = attrs.field(
-        default="", metadata={"description": "file that `quadvel calibrate` wrote of this robot; empty: none"}
-    )
-    dry_run: bool = attrs.field(
-        default=False,
-        metadata={"description": "send nothing, hear nothing, and show once a second what would be sent"},
-    )
-
-    @state_rate.validator
-    def _is_rate(self, attribute: object, value: int) -> None:
-        if not 50 <= value <= MAX_STATE_RATE_HZ:
-            raise ValueError(f"state_rate is {value} Hz, expected 50 to {MAX_STATE_RATE_HZ}")
+    calibration: str = field("", "file that `quadvel calibrate` wrote of this robot; empty: none")
+    dry_run: bool = field(False, "send nothing, hear nothing, and show once a second what would be sent")
 
     def load_calibration(self) -> Calibration:
         """Load the calibration of the robot.

@@ -13,12 +13,12 @@ A command is given when its last button goes down. A stopped robot accepts only 
 from __future__ import annotations
 
 from enum import Enum
-from typing import Any
 
 import attrs
 import numpy as np
 
 from quadvel_description.arrays import Array
+from quadvel_description.fields import field
 
 from .wire import Button, Remote
 
@@ -47,10 +47,6 @@ BUTTONS = {
 """Buttons of each command; the first match counts."""
 
 
-def _setting(default: Any, description: str) -> Any:
-    return attrs.field(default=default, metadata={"description": description})
-
-
 @attrs.frozen(kw_only=True, slots=False)  # for multiple inheritance
 class RemoteConfig:
     """Conversion of stick positions to velocities.
@@ -63,8 +59,8 @@ class RemoteConfig:
         ValueError: A value is out of range; raised by the constructor.
     """
 
-    stick_dead_zone: float = _setting(0.08, "share of a stick's range, 0 to 1, that counts as released")
-    stick_velocity: tuple[float, ...] = _setting(
+    stick_dead_zone: float = field(0.08, "share of a stick's range, 0 to 1, that counts as released")
+    stick_velocity: tuple[float, ...] = field(
         (0.8, 0.4, 0.8), "velocity at full stick: forward, sideways, turning, m/s, rad/s"
     )
 

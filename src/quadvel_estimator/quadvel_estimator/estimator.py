@@ -21,12 +21,13 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from quadvel_description.arrays import Array
-from quadvel_description.frames import BASE, ODOM, Placed, footprint
+from quadvel_description.fields import field
+from quadvel_description.frames import BASE, ODOM, FramePose, footprint
 from quadvel_description.kinematics import rotate
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
-from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state
+from quadvel_nodes.messages import MessageError, Refusals, read_low_state, read_numbers
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transform_messages
 from quadvel_nodes.scheduling import Scheduling
@@ -46,10 +47,6 @@ HEIGHT_VARIANCE = 1e6
 _ANGULAR = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])  # selects the rotations about x, y, z
 
 
-def _parameter(default: Any, description: str) -> Any:
-    return attrs.field(default=default, metadata={"description": description})
-
-
 @attrs.frozen
 class EstimatorParameters(Scheduling):
     """Parameters of the node `estimator`.
@@ -63,20 +60,14 @@ class EstimatorParameters(Scheduling):
         publish_tf: Whether to publish transforms on /tf.
     """
 
-    kind: str = _parameter("learned", f"how velocity is estimated: {' or '.join(KINDS)}")
-    model: str = _parameter("", "file of the learned estimator's network, ONNX; empty: the shipped one")
-    reset_gap: float = _parameter(0.1, "time without a state after which the estimator is reset, s")
-    odom_frame: str = _parameter(ODOM, "frame of the odometry's pose")
-    body_frame: str = _parameter(BASE, "frame of the velocities, the odometry's child")
-    publish_tf: bool = _parameter(
+    kind: str = field("learned", f"how velocity is estimated: {' or '.join(KINDS)}", one_of=KINDS)
+    model: str = field("", "file of the learned estimator's network, ONNX; empty: the shipped one")
+    reset_gap: float = field(0.1, "time without a state after which the estimator is reset, s", above=0.0)
+    odom_frame: str = field(ODOM, "frame of the odometry's pose")
+    body_frame: str = field(BASE, "frame of the velocities, the odometry's child")
+    publish_tf: bool = field(
         True, "whether to publish the transforms of body_frame in odom_frame and of base_footprint"
     )
-
-    def __attrs_post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"kind is {self.kind!r}, expected {' or '.join(KINDS)}")
-        if not self.reset_gap > 0.0:
-            raise ValueError(f"reset_gap is {self.reset_gap}, expected a time above 0 s")
 
     def make_estimator(self) -> Estimator:
         """Create the estimator that `kind` names.
@@ -122,7 +113,7 @@ class EstimatorNode(Node):
     def _on_command(self, message: Any) -> None:
         try:
             self._tracker.set_previous_action(
-                features.previous_action(numbers(message, "q", 12), message.mode)
+                features.previous_action(read_numbers(message, "q", 12), message.mode)
             )
         except MessageError as error:
             self._refusals.add("low_cmd", error)
@@ -172,7 +163,7 @@ class EstimatorNode(Node):
         self._odom.publish(message)
         if self._settings.publish_tf:
             frames = self._settings
-            base = Placed(frames.odom_frame, frames.body_frame, position, state.quaternion)
+            base = FramePose(frames.odom_frame, frames.body_frame, position, state.quaternion)
             below = attrs.evolve(floor, parent=frames.body_frame)
             self._tf.publish(TFMessage(transforms=transform_messages(stamp, [base, below])))
 

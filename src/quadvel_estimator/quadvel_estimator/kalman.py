@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadvel_description.arrays import Array
+from quadvel_description.fields import field
 from quadvel_description.kinematics import foot_kinematics, rotation_matrix
 from quadvel_description.robot import GRAVITY
 from quadvel_description.state import RobotState
@@ -39,11 +40,6 @@ MEASUREMENT_MATRIX[:4, 0], MEASUREMENT_MATRIX[:4, FOOT_ROWS], MEASUREMENT_MATRIX
 )
 
 
-def _positive(low: float, default: float, high: float) -> Any:
-    """Declare a positive parameter with the bounds for tuning."""
-    return attrs.field(default=default, validator=attrs.validators.gt(0.0), metadata={"bounds": (low, high)})
-
-
 @attrs.frozen
 class KalmanConfig:
     """Noise (standard deviations) and contact thresholds of the filter.
@@ -62,16 +58,14 @@ class KalmanConfig:
             torques, which every robot has).
     """
 
-    accelerometer: float = _positive(0.05, 16.2, 50.0)
-    foot_position: float = _positive(1e-4, 0.0102, 0.2)
-    foot_velocity: float = _positive(0.01, 0.465, 2.0)
-    foot_walk: float = _positive(1e-4, 0.00296, 0.5)
-    slip_gate: float = _positive(0.1, 0.564, 10.0)
-    contact_force: float = _positive(0.5, 2.42, 60.0)
-    contact_ramp: float = _positive(0.5, 3.34, 150.0)
-    contact_source: Literal["foot_force", "torque"] = attrs.field(
-        default="torque", validator=attrs.validators.in_(("foot_force", "torque"))
-    )
+    accelerometer: float = field(16.2, above=0.0, tuning=(0.05, 50.0))
+    foot_position: float = field(0.0102, above=0.0, tuning=(1e-4, 0.2))
+    foot_velocity: float = field(0.465, above=0.0, tuning=(0.01, 2.0))
+    foot_walk: float = field(0.00296, above=0.0, tuning=(1e-4, 0.5))
+    slip_gate: float = field(0.564, above=0.0, tuning=(0.1, 10.0))
+    contact_force: float = field(2.42, above=0.0, tuning=(0.5, 60.0))
+    contact_ramp: float = field(3.34, above=0.0, tuning=(0.5, 150.0))
+    contact_source: Literal["foot_force", "torque"] = field("torque", one_of=("foot_force", "torque"))
 
     @classmethod
     def bounds(cls) -> dict[str, tuple[float, float]]:
@@ -80,7 +74,7 @@ class KalmanConfig:
         Returns:
             Least and greatest value by name, in the order of `vector`.
         """
-        return {f.name: f.metadata["bounds"] for f in attrs.fields(cls) if "bounds" in f.metadata}
+        return {f.name: f.metadata["tuning"] for f in attrs.fields(cls) if "tuning" in f.metadata}
 
     def vector(self) -> Array:
         """Return the parameters as a vector for an optimiser.

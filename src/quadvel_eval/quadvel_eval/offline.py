@@ -24,7 +24,7 @@ from quadvel_estimator.tracker import Estimator, VelocityTracker
 from quadvel_nodes.messages import MessageError, read_low_state
 from quadvel_nodes.number_text import number_text
 from quadvel_nodes.stall_free_clock import StallFreeClock
-from quadvel_recordings.output import output_folder, replacing
+from quadvel_recordings.output import atomic_write, output_folder
 from quadvel_recordings.reading import RecordingError, read_messages
 
 from .demo_figures import AXIS_LABELS
@@ -267,10 +267,10 @@ def _write(
         "torque_error_nm": dict(zip(JOINT_NAMES, map(rounded, comparison.errors.tolist()), strict=True)),
         "velocity_error": {name: [rounded(one) for one in error.tolist()] for name, error in errors.items()},
     }
-    with replacing(out / "replay.json") as draft:
+    with atomic_write(out / "replay.json") as draft:
         draft.write_text(json.dumps(result, indent=1))
     for name, figure in pictures.items():
-        with replacing(out / f"{name}.png") as draft:
+        with atomic_write(out / f"{name}.png") as draft:
             figure.savefig(draft, dpi=110)
     typer.echo(f"written: {out}/replay.json, {', '.join(f'{name}.png' for name in pictures)}")
 

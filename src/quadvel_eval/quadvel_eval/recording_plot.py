@@ -21,7 +21,7 @@ from matplotlib.patches import Patch
 from quadvel_description.arrays import Array
 from quadvel_description.robot import JOINT_NAMES, TORQUE_LIMIT
 from quadvel_recordings.joint_log import JointLog, read_joint_log
-from quadvel_recordings.output import output_folder, replacing
+from quadvel_recordings.output import atomic_write, output_folder
 from quadvel_recordings.reading import RecordingError, read_messages
 from quadvel_recordings.stamps import missing_stamp_notices, stamp_of
 
@@ -404,6 +404,6 @@ def plot_command(
         if figure is None:
             typer.echo(f"no {name}.png: its topics were not recorded")
             continue
-        with replacing(out / f"{name}.png") as draft:
+        with atomic_write(out / f"{name}.png") as draft:
             figure.savefig(draft, dpi=110)
         typer.echo(f"written: {out / name}.png")

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from quadvel_description.arrays import Array
-from quadvel_recordings.output import replacing
+from quadvel_recordings.output import atomic_write
 
 CSV_COLUMNS = (
     "plant",
@@ -53,7 +53,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
         path: The file.
         content: Its content. NaN and infinity raise a ValueError.
     """
-    with replacing(path) as draft:
+    with atomic_write(path) as draft:
         draft.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
@@ -64,7 +64,7 @@ def write_figure(path: Path, figure: Figure) -> None:
         path: The file.
         figure: The figure.
     """
-    with replacing(path) as draft:
+    with atomic_write(path) as draft:
         figure.savefig(draft, dpi=120)
 
 
@@ -76,7 +76,7 @@ def write_evaluation(folder: Path, evaluation: Mapping[str, Any]) -> None:
         evaluation: Result of `grid.evaluate`, with its setup.
     """
     write_json(folder / "eval.json", evaluation)
-    with replacing(folder / "eval.csv") as draft, draft.open("w", newline="") as file:
+    with atomic_write(folder / "eval.csv") as draft, draft.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(CSV_COLUMNS)
         for plant, one in (("usual", evaluation), ("second", evaluation["second_plant"])):

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description.arrays import Array
 from quadvel_description.mjcf import load_model
-from quadvel_recordings.output import replacing
+from quadvel_recordings.output import atomic_write
 
 from .demo_figures import tracking_figure
 from .demo_summary import constant_commands
@@ -110,7 +110,7 @@ def write_video(path: Path, recording: Recording) -> None:
     from imageio_ffmpeg import write_frames
 
     start, end = recording.position.time[[0, -1]]
-    with replacing(path) as draft, Film(recording, *VIDEO_SIZE) as film:
+    with atomic_write(path) as draft, Film(recording, *VIDEO_SIZE) as film:
         video = write_frames(str(draft), VIDEO_SIZE, fps=FRAMES_PER_SECOND, quality=7, macro_block_size=8)
         video.send(None)  # starts the encoder
         for frame in film.frames(np.arange(start, end, 1.0 / FRAMES_PER_SECOND)):

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadvel_description.arrays import Array
+from quadvel_description.fields import field
 
 from .clearance import Clearance
 from .clusters import Scan
@@ -81,19 +82,6 @@ class State(Enum):
     BLIND = "blind"
 
 
-def _parameter(default: Any, description: str, positive: bool = True) -> Any:
-    """Return an attrs field of a node parameter with finite (positive) numbers."""
-
-    def check(_: object, field: Any, value: Any) -> None:
-        numbers = np.ravel(value)
-        if not (np.isfinite(numbers).all() and (not positive or (numbers > 0.0).all())):
-            raise ValueError(
-                f"{field.name} is {value}, expected finite numbers{' above 0' if positive else ''}"
-            )
-
-    return attrs.field(default=default, validator=check, metadata={"description": description})
-
-
 @attrs.frozen(kw_only=True)
 class FollowConfig:
     """Parameters of the planner: distance, limits of the robot, mounting of the laser, timeouts.
@@ -104,33 +92,31 @@ class FollowConfig:
         ValueError: A number is not finite or not positive, or the side is unknown.
     """
 
-    distance: float = _parameter(1.5, "distance to the person, m")
-    side: str = attrs.field(
-        default="behind",
-        validator=attrs.validators.in_(SIDES),
-        metadata={"description": "place of the robot: behind, left or right of the person"},
+    distance: float = field(1.5, "distance to the person, m", above=0.0)
+    side: str = field("behind", "place of the robot: behind, left or right of the person", one_of=SIDES)
+    clearance: float = field(0.3, "desired clearance between outline and obstacles, m", above=0.0)
+    max_velocity: Axes = field((2.5, 0.6, 1.5), "largest commanded vx, vy, wz, m/s, rad/s", above=0.0)
+    acceleration: Axes = field(
+        (1.2, 0.8, 1.5), "largest change of a command away from zero, m/s^2, rad/s^2", above=0.0
     )
-    clearance: float = _parameter(0.3, "desired clearance between outline and obstacles, m")
-    max_velocity: Axes = _parameter((2.5, 0.6, 1.5), "largest commanded vx, vy, wz, m/s, rad/s")
-    acceleration: Axes = _parameter(
-        (1.2, 0.8, 1.5), "largest change of a command away from zero, m/s^2, rad/s^2"
+    deceleration: Axes = field(
+        (2.5, 1.5, 3.0), "largest change of a command towards zero, m/s^2, rad/s^2", above=0.0
     )
-    deceleration: Axes = _parameter(
-        (2.5, 1.5, 3.0), "largest change of a command towards zero, m/s^2, rad/s^2"
+    stop_deceleration: Axes = field(
+        (5.0, 4.0, 8.0), "the same for an immediate stop, m/s^2, rad/s^2", above=0.0
     )
-    stop_deceleration: Axes = _parameter((5.0, 4.0, 8.0), "the same for an immediate stop, m/s^2, rad/s^2")
-    length: float = _parameter(0.65, "length of the robot's outline, legs included, m")
-    width: float = _parameter(0.35, "width of the robot's outline, m")
-    laser_x: float = _parameter(
-        0.25, "position of the laser on the robot: forward, m; as in the shipped worlds", positive=False
+    length: float = field(0.65, "length of the robot's outline, legs included, m", above=0.0)
+    width: float = field(0.35, "width of the robot's outline, m", above=0.0)
+    laser_x: float = field(
+        0.25, "position of the laser on the robot: forward, m; as in the shipped worlds", at_least=-np.inf
     )
-    laser_y: float = _parameter(0.0, "position of the laser on the robot: left, m", positive=False)
-    laser_yaw: float = _parameter(0.0, "yaw of the laser on the robot, rad", positive=False)
-    scan_timeout: float = _parameter(0.2, "silence of the scan after which the robot stops, s")
-    odom_timeout: float = _parameter(0.2, "silence of the odometry after which the robot stops, s")
-    person_timeout: float = _parameter(0.2, "silence of the tracker after which the person is lost, s")
-    robot_timeout: float = _parameter(
-        0.5, "silence of the controller after which its last refusal expires, s"
+    laser_y: float = field(0.0, "position of the laser on the robot: left, m", at_least=-np.inf)
+    laser_yaw: float = field(0.0, "yaw of the laser on the robot, rad", at_least=-np.inf)
+    scan_timeout: float = field(0.2, "silence of the scan after which the robot stops, s", above=0.0)
+    odom_timeout: float = field(0.2, "silence of the odometry after which the robot stops, s", above=0.0)
+    person_timeout: float = field(0.2, "silence of the tracker after which the person is lost, s", above=0.0)
+    robot_timeout: float = field(
+        0.5, "silence of the controller after which its last refusal expires, s", above=0.0
     )
 
 

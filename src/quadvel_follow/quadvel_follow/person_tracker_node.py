@@ -19,6 +19,7 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import LaserScan
 from visualization_msgs.msg import Marker, MarkerArray
 
+from quadvel_description.fields import field
 from quadvel_msgs.msg import Person, Persons
 from quadvel_msgs.srv import SelectPerson
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
@@ -43,11 +44,6 @@ MARKER_RGBA = {
 }
 
 
-def _parameter(default: Any, description: str) -> Any:
-    """Return an attrs field of a node parameter."""
-    return attrs.field(default=default, metadata={"description": description})
-
-
 @attrs.frozen
 class PersonTrackerParameters:
     """Parameters of the node `person_tracker`.
@@ -56,23 +52,18 @@ class PersonTrackerParameters:
         ValueError: A number is not finite.
     """
 
-    model: str = _parameter("", "ONNX file of the leg classifier; empty: the shipped one")
-    use_odom: bool = _parameter(
+    model: str = field("", "ONNX file of the leg classifier; empty: the shipped one")
+    use_odom: bool = field(
         True, "whether the robot's pose comes from odom; else tracks are in the frame of the scans"
     )
-    laser_x: float = _parameter(
-        0.25, "position of the laser on the robot: forward, m; as in the shipped worlds"
+    laser_x: float = field(
+        0.25, "position of the laser on the robot: forward, m; as in the shipped worlds", at_least=-np.inf
     )
-    laser_y: float = _parameter(0.0, "position of the laser on the robot: left, m")
-    laser_yaw: float = _parameter(0.0, "yaw of the laser on the robot, rad")
-    select_nearest: bool = _parameter(
+    laser_y: float = field(0.0, "position of the laser on the robot: left, m", at_least=-np.inf)
+    laser_yaw: float = field(0.0, "yaw of the laser on the robot, rad", at_least=-np.inf)
+    select_nearest: bool = field(
         True, "whether the nearest person ahead is selected until select_person is called"
     )
-
-    def __attrs_post_init__(self) -> None:
-        for name in ("laser_x", "laser_y", "laser_yaw"):
-            if not np.isfinite(getattr(self, name)):
-                raise ValueError(f"{name} is {getattr(self, name)}, expected a finite number")
 
     def make_detector(self) -> LegDetector:
         """Load the leg detector.

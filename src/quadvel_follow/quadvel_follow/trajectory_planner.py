@@ -12,6 +12,7 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 
+from quadvel_description.fields import field
 from quadvel_nodes.messages import MessageError, Refusals
 from quadvel_nodes.node import read_parameters, request_exit, run
 
@@ -26,18 +27,9 @@ ODOM_TIMEOUT_S = 0.2
 class TrajectoryParameters:
     """Parameters of the node `trajectory_planner`."""
 
-    file: str = attrs.field(
-        default="zju", metadata={"description": "CSV or GPX file, or a shipped one: zju, eight"}
-    )
-    closed_loop: bool = attrs.field(
-        default=False,
-        metadata={"description": "whether deviations of odom from the trajectory are corrected"},
-    )
-    speed: float = attrs.field(
-        default=0.5,
-        validator=attrs.validators.gt(0.0),
-        metadata={"description": "speed along a file of places, m/s"},
-    )
+    file: str = field("zju", "CSV or GPX file, or a shipped one: zju, eight")
+    closed_loop: bool = field(False, "whether deviations of odom from the trajectory are corrected")
+    speed: float = field(0.5, "speed along a file of places, m/s", above=0.0)
 
     def load(self) -> Trajectory:
         """Load the trajectory.

@@ -23,7 +23,7 @@ from quadvel_eval.following.tour_cli import run_tour
 from quadvel_eval.recording import Recording, read_recording
 from quadvel_eval.report import segment_table, write_figure, write_json
 from quadvel_nodes.number_text import number_text
-from quadvel_recordings.output import output_folder, replacing
+from quadvel_recordings.output import atomic_write, output_folder
 from quadvel_sim.world import SHIPPED_WORLDS
 
 from .follow_demo import follow
@@ -115,7 +115,7 @@ def demo_command(
     check_stack(stack)
     folder = output_folder(out or Path("out/demo"))
     recorded = folder / "demo.mcap"
-    with replacing(recorded) as draft:
+    with atomic_write(recorded) as draft:
         script = "quick" if quick else "full"
         problem = ScriptedWalk(draft, script, stack.commands(view), lockstep, console).run()
     for name in DERIVED_FILES:

@@ -30,7 +30,7 @@ from quadvel_description.kinematics import roll_pitch
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_eval.report import read_json
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
-from quadvel_recordings.output import output_file, replacing
+from quadvel_recordings.output import atomic_write, output_file
 from quadvel_sysid.excitation import EXCITATIONS, PERIOD_S, Excitation, limit_torque, propose
 
 RAMP_S = 1.5
@@ -295,7 +295,7 @@ def record_motion(
         with (
             StopSignals() as signals,
             bar,
-            replacing(path) as draft,
+            atomic_write(path) as draft,
             ProcessGroup(PrefixedOutput(nodes, console)) as group,
         ):
             for name, line in nodes.items():

@@ -19,7 +19,7 @@ from quadvel_bringup.preflight import check_stack
 from quadvel_bringup.stack import Stack
 from quadvel_eval.following.recorded import read_following
 from quadvel_eval.following.tour_report import tour_table, write_tour
-from quadvel_recordings.output import replacing
+from quadvel_recordings.output import atomic_write
 from quadvel_sim.world import World
 
 from .recorded_run import RecordedRun
@@ -128,7 +128,7 @@ def follow(folder: Path, world: str, seconds: float, view: bool, console: Consol
     check_stack(stack)
     recorded = folder / "follow.mcap"
     x, y, _ = loaded.laser.position.tolist()
-    with replacing(recorded) as draft:
+    with atomic_write(recorded) as draft:
         problem = FollowedWalk(draft, stack, (x, y), seconds, view, console).run()
     if problem:
         console.print(f"[bold red]{problem}")

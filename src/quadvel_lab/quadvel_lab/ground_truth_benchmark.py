@@ -30,7 +30,7 @@ from quadvel_eval.recording import Recording, read_recording
 from quadvel_eval.report import read_json, write_json
 from quadvel_eval.script import SCRIPTS, Drive
 from quadvel_eval.segments import Segment, rounded
-from quadvel_recordings.output import output_folder, replacing
+from quadvel_recordings.output import atomic_write, output_folder
 
 from .ground_truth_page import ROWS, summary_sentence, twin_page
 from .plant import read_plant
@@ -82,7 +82,7 @@ def twin_command(
     for result in results:
         console.print(_table(result))
     write_json(folder / "twin.json", {"schema": SCHEMA, "plants": results})
-    with replacing(folder / "twin.html") as draft:
+    with atomic_write(folder / "twin.html") as draft:
         draft.write_text(twin_page(results), encoding="utf-8")
     console.print(f"{summary_sentence(results)}\nwritten to {folder}: twin.html, twin.json", highlight=False)
 
@@ -119,7 +119,7 @@ def plant_nodes(file: Path, seed: int) -> dict[str, list[str]]:
 
 def _walk(file: Path, recording: Path, seed: int, console: Console) -> None:
     """Record a walk of the plant; exit code 1 if it did not complete the script."""
-    with replacing(recording) as draft:
+    with atomic_write(recording) as draft:
         problem = ScriptedWalk(draft, SCRIPT, plant_nodes(file, seed), True, console).run()
         if problem:
             console.print(f"[bold red]{file.stem} did not walk to the end: {problem}")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,6 +22,8 @@ from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_description import robot
 from quadvel_description.arrays import Array
 from quadvel_description.bounded_yaml import read_yaml
+from quadvel_description.fields import field
+from quadvel_description.records import structure_record
 from quadvel_description.state import RobotState
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.simulator import DT, Simulator
@@ -49,7 +52,7 @@ class HiddenPhysics(Protocol):
         """
 
 
-@attrs.define
+@attrs.define(kw_only=True)
 class DryGear(HiddenPhysics):
     """Friction of a dry gear: the LuGre bristle model (Canudas de Wit et al., 1995).
 
@@ -61,8 +64,8 @@ class DryGear(HiddenPhysics):
         memory: Deflection z of the bristles, (12,) rad.
     """
 
-    slip: Array
-    stick: Array
+    slip: Array = field(size=12)
+    stick: Array = field(size=12)
     stribeck_speed: float = 0.25
     stiffness: float = 250.0
     memory: Array = attrs.Factory(lambda: np.zeros(12))
@@ -79,7 +82,7 @@ class DryGear(HiddenPhysics):
         return np.where(level > 0.0, asked - self.stiffness * self.memory, asked)
 
 
-@attrs.define
+@attrs.define(kw_only=True)
 class SlowCurrent(HiddenPhysics):
     """A slow current loop: proportional current control of a winding, with uncompensated back-EMF.
 
@@ -89,8 +92,8 @@ class SlowCurrent(HiddenPhysics):
         memory: Current times torque constant, (12,) N m; NaN before the first step.
     """
 
-    constant: Array
-    droop: Array
+    constant: Array = field(size=12)
+    droop: Array = field(size=12)
     memory: Array = attrs.Factory(lambda: np.full(12, np.nan))
 
     @override
@@ -107,7 +110,7 @@ class SlowCurrent(HiddenPhysics):
         return np.where(self.constant > 0.0, mean, asked)
 
 
-@attrs.define
+@attrs.define(kw_only=True)
 class ChafingCable(HiddenPhysics):
     """Friction and a constant pull of a cable that chafes in a part of a joint's range.
 
@@ -118,8 +121,8 @@ class ChafingCable(HiddenPhysics):
         memory: Empty; the effect has no state.
     """
 
-    rub: Array
-    begin: Array
+    rub: Array = field(size=12)
+    begin: Array = field(size=12)
     width: float = 0.08
     memory: Array = attrs.Factory(lambda: np.zeros(0))
 
@@ -130,7 +133,7 @@ class ChafingCable(HiddenPhysics):
         return asked - self.rub * touching * (0.4 + np.tanh(dq / 0.2))
 
 
-PLANT_KINDS: dict[str, Callable[..., HiddenPhysics]] = {
+PLANT_KINDS: dict[str, type[HiddenPhysics]] = {
     "dry_gear": DryGear,
     "slow_current": SlowCurrent,
     "chafing_cable": ChafingCable,
@@ -252,29 +255,25 @@ def read_plant(path: Path) -> Callable[[], HiddenPhysics]:
         ValueError: The content is wrong; the sentence names file, field and expectation.
     """
     content = read_yaml(path, "a YAML file of a plant")
-    if not isinstance(content, Mapping) or content.get("kind") not in PLANT_KINDS:
-        found = content.get("kind") if isinstance(content, Mapping) else content
-        raise ValueError(f"{path}: kind: found {found!r}, expected one of {', '.join(PLANT_KINDS)}")
-    values = {name: _value(path, name, value) for name, value in content.items() if name != "kind"}
+    fields = dict(content) if isinstance(content, Mapping) else {"kind": content}
+    if (kind := fields.pop("kind", None)) not in PLANT_KINDS:
+        raise ValueError(f"{path}: kind: found {kind!r}, expected one of {', '.join(PLANT_KINDS)}")
+    values = {name: _by_joint(path, name, value) for name, value in fields.items()}
+    make = partial(structure_record, PLANT_KINDS[kind], values, path)
+    make()  # refuse wrong fields now
+    return make
+
+
+def _by_joint(path: Path, name: str, value: Any) -> Any:
+    """Convert numbers by joint to (12,), 0 for missing joints; leave any other value."""
+    if not isinstance(value, Mapping):
+        return value
+    numbers = np.zeros(12)
     try:
-        PLANT_KINDS[content["kind"]](**values)
-    except TypeError as error:
-        raise ValueError(f"{path}: {error}") from None
-    return lambda: PLANT_KINDS[content["kind"]](**values)
-
-
-def _value(path: Path, name: str, value: Any) -> Any:
-    """Convert a number, or numbers by joint (0 for missing joints) to (12,)."""
-    if isinstance(value, Mapping):
-        numbers = np.zeros(12)
-        try:
-            numbers[robot.joint_index(list(value))] = list(value.values())
-        except ValueError as error:
-            raise ValueError(f"{path}: {name}: {error}") from None
-        return numbers
-    if not isinstance(value, (int, float)):
-        raise ValueError(f"{path}: {name}: found {value!r}, expected a number, or numbers by joint")
-    return float(value)
+        numbers[robot.joint_index(list(value))] = list(value.values())
+    except ValueError as error:
+        raise ValueError(f"{path}: {name}: {error}") from None
+    return numbers
 
 
 def main() -> None:

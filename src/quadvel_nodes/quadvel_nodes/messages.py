@@ -61,7 +61,7 @@ def seconds(stamp: Any) -> float:
     return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
-def numbers(message: Any, field: str, size: int) -> Array:
+def read_numbers(message: Any, field: str, size: int) -> Array:
     """Read one field of a message as an array of finite numbers.
 
     Args:
@@ -98,7 +98,7 @@ class _NumericFields:
         # np.count_nonzero is faster than np.all for short arrays.
         if list(map(len, values)) != self._sizes or np.count_nonzero(np.isfinite(block)) < len(block):
             for field, size in zip(self._fields, self._sizes, strict=True):
-                numbers(message, field, size)
+                read_numbers(message, field, size)
         return [block[part] for part in self._slices]
 
 

@@ -19,7 +19,7 @@ from tf2_msgs.msg import TFMessage
 
 from quadvel_description import robot
 from quadvel_description.arrays import Array
-from quadvel_description.frames import IMU, Placed, fixed_links, moving_links
+from quadvel_description.frames import IMU, FramePose, fixed_links, moving_links
 from quadvel_description.state import RobotState
 from quadvel_description.urdf import urdf
 
@@ -77,7 +77,7 @@ class RobotView:
         self._imu.publish(imu)
 
 
-def transform_messages(stamp: Any, placed: Sequence[Placed]) -> list[Any]:
+def transform_messages(stamp: Any, placed: Sequence[FramePose]) -> list[Any]:
     """Convert frames to transform messages.
 
     Args:

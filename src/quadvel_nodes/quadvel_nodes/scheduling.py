@@ -14,6 +14,8 @@ from pathlib import Path
 
 import attrs
 
+from quadvel_description.fields import field
+
 MAX_REALTIME_PRIORITY = 99
 THREADS_DIR = Path("/proc/self/task")
 WATCHDOG_PERIOD_S = 0.05
@@ -45,20 +47,14 @@ class Scheduling:
         ValueError: A parameter is malformed; raised by the constructor.
     """
 
-    realtime_priority: int = attrs.field(
-        default=0,
-        metadata={
-            "description": "priority of the control thread among real-time ones (SCHED_FIFO), 1 to 99; 0: none"
-        },
+    realtime_priority: int = field(
+        0,
+        "priority of the control thread among real-time ones (SCHED_FIFO), 1 to 99; 0: none",
+        at_least=0,
+        at_most=MAX_REALTIME_PRIORITY,
+        whole=True,
     )
-    cpus: str = attrs.field(
-        default="", metadata={"description": "cores that the node may use, such as 2,3; empty: any"}
-    )
-
-    @realtime_priority.validator
-    def _is_priority(self, attribute: object, value: int) -> None:
-        if not 0 <= value <= MAX_REALTIME_PRIORITY:
-            raise ValueError(f"realtime_priority is {value}, expected 0 to {MAX_REALTIME_PRIORITY}")
+    cpus: str = field("", "cores that the node may use, such as 2,3; empty: any")
 
     @cpus.validator
     def _are_cores(self, attribute: object, value: str) -> None:

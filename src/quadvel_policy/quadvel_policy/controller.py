@@ -23,7 +23,14 @@ from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand, Waiting
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
-from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state, seconds, write_low_cmd
+from quadvel_nodes.messages import (
+    MessageError,
+    Refusals,
+    read_low_state,
+    read_numbers,
+    seconds,
+    write_low_cmd,
+)
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.number_text import number_text
 from quadvel_nodes.scheduling import Scheduling
@@ -137,7 +144,7 @@ class Controller(Node):
 
     def _on_motors(self, message: Any) -> None:
         try:
-            temperature = numbers(message, "temperature", 12)
+            temperature = read_numbers(message, "temperature", 12)
         except MessageError as error:
             self._refusals.add("motor_status", error)
             return

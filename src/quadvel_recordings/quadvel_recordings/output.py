@@ -29,7 +29,7 @@ def created_folder(folder: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """Write a file atomically: the draft replaces `path` only if the block succeeds.
 
     A missing folder is created, and removed again if the block fails.
@@ -52,7 +52,7 @@ def replacing(path: Path) -> Iterator[Path]:
 def output_folder(path: Path) -> Path:
     """Check that files can be written to a folder, without leaving a trace.
 
-    `replacing` creates a missing folder later.
+    `atomic_write` creates a missing folder later.
 
     Args:
         path: The folder.
@@ -68,7 +68,7 @@ def output_folder(path: Path) -> Path:
 
 
 def output_file(path: Path) -> Path:
-    """Check that a file can be written by `replacing`, without leaving a trace.
+    """Check that a file can be written by `atomic_write`, without leaving a trace.
 
     Args:
         path: The file.

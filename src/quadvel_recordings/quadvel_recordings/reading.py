@@ -19,8 +19,8 @@ from rosbags.rosbag1.reader import decompressors
 from rosbags.rosbag2 import Reader
 
 from .bounds import TooLargeError, check_chunks, check_packed_file, decompress
-from .cut_off import is_truncated, recover_messages, recovery_summary
 from .recorded import deserialize, is_known
+from .truncated import is_truncated, recover_messages, recovery_summary
 
 STORAGES = {".mcap": "mcap", ".db3": "sqlite3"}
 """Storage identifiers of metadata.yaml by suffix of the file."""

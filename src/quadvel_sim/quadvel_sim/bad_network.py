@@ -7,19 +7,14 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from typing import Any
 
 import attrs
 import numpy as np
-from attrs.validators import ge, le
+
+from quadvel_description.fields import field
 
 REORDERING_DELAY_S = 0.005
 """Additional delay of a reordered packet, s: later packets overtake it."""
-
-
-def _setting(description: str, upper: float = 1.0) -> Any:
-    """Return an attrs field: a number from 0 to `upper`, 0 by default."""
-    return attrs.field(default=0.0, validator=[ge(0.0), le(upper)], metadata={"description": description})
 
 
 @attrs.frozen(kw_only=True, slots=False)  # no slots: a subclass may have a second base class
@@ -39,15 +34,22 @@ class NetworkConfig:
         network_seed: Seed of all random draws.
     """
 
-    network_delay: float = _setting("constant delay of every packet, s")
-    network_jitter: float = _setting("largest additional delay of a packet, s, uniformly distributed")
-    network_loss: float = _setting("share of lost packets, 0 to 1")
-    network_duplicates: float = _setting("share of duplicated packets, 0 to 1")
-    network_reordering: float = _setting(
-        f"share of packets that arrive {1e3 * REORDERING_DELAY_S:g} ms late, after later ones"
+    network_delay: float = field(0.0, "constant delay of every packet, s", at_least=0.0, at_most=1.0)
+    network_jitter: float = field(
+        0.0, "largest additional delay of a packet, s, uniformly distributed", at_least=0.0, at_most=1.0
     )
-    network_corruption: float = _setting("share of packets with one to eight flipped bits")
-    network_seed: int = attrs.field(default=0, metadata={"description": "seed of the network's faults"})
+    network_loss: float = field(0.0, "share of lost packets, 0 to 1", at_least=0.0, at_most=1.0)
+    network_duplicates: float = field(0.0, "share of duplicated packets, 0 to 1", at_least=0.0, at_most=1.0)
+    network_reordering: float = field(
+        0.0,
+        f"share of packets that arrive {1e3 * REORDERING_DELAY_S:g} ms late, after later ones",
+        at_least=0.0,
+        at_most=1.0,
+    )
+    network_corruption: float = field(
+        0.0, "share of packets with one to eight flipped bits", at_least=0.0, at_most=1.0
+    )
+    network_seed: int = field(0, "seed of the network's faults")
 
 
 class BadNetwork:

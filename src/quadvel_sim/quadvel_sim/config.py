@@ -11,7 +11,7 @@ import numpy as np
 from quadvel_actuator import ActuatorParameters
 from quadvel_description import robot
 from quadvel_description.arrays import Array
-from quadvel_sim.checks import number, numbers, whole_number
+from quadvel_description.fields import field
 from quadvel_sim.physics import Physics
 from quadvel_sim.terrain import Terrain
 from quadvel_sim.world import World
@@ -29,11 +29,11 @@ class SensorNoise:
         orientation: Rotation about each body axis, rad.
     """
 
-    q: float = attrs.field(default=5e-4, **number(0.0))
-    dq: float = attrs.field(default=0.03, **number(0.0))
-    angular_velocity: float = attrs.field(default=0.01, **number(0.0))
-    linear_acceleration: float = attrs.field(default=0.1, **number(0.0))
-    orientation: float = attrs.field(default=2e-3, **number(0.0))
+    q: float = field(5e-4, at_least=0.0)
+    dq: float = field(0.03, at_least=0.0)
+    angular_velocity: float = field(0.01, at_least=0.0)
+    linear_acceleration: float = field(0.1, at_least=0.0)
+    orientation: float = field(2e-3, at_least=0.0)
 
     @classmethod
     def none(cls) -> SensorNoise:
@@ -75,18 +75,18 @@ class SimulatorConfig:
     terrain: Terrain = attrs.field(factory=Terrain)
     world: World | None = None
     noise: SensorNoise = attrs.field(factory=SensorNoise)
-    seed: int = attrs.field(default=0, **whole_number())
-    friction: Array = attrs.field(default=0.8, **numbers(4, low=0.0))
-    payload: float = attrs.field(default=0.0, **number(-8.0, 50.0))
-    payload_position: Array = attrs.field(default=(0.0, 0.0, 0.1), **numbers(3))
-    armature: Array = attrs.field(factory=lambda: robot.ARMATURE, **numbers(12, low=1e-4))
-    joint_friction: Array = attrs.field(factory=lambda: robot.FRICTION, **numbers(12, low=0.0))
-    joint_damping: Array = attrs.field(factory=lambda: robot.DAMPING, **numbers(12, low=0.0))
+    seed: int = field(0, at_least=0, whole=True)
+    friction: Array = field(0.8, size=4, at_least=0.0)
+    payload: float = field(0.0, at_least=-8.0, at_most=50.0)
+    payload_position: Array = field((0.0, 0.0, 0.1), size=3)
+    armature: Array = field(attrs.Factory(lambda: robot.ARMATURE), size=12, at_least=1e-4)
+    joint_friction: Array = field(attrs.Factory(lambda: robot.FRICTION), size=12, at_least=0.0)
+    joint_damping: Array = field(attrs.Factory(lambda: robot.DAMPING), size=12, at_least=0.0)
     physics: Physics = attrs.field(factory=Physics)
     suspended: bool = False
-    watchdog: float = attrs.field(default=0.02, **number(0.001))
-    watchdog_kd: float = attrs.field(default=5.0, **number(0.0, 50.0))
-    fall_tilt: float = attrs.field(default=1.0, **number(0.1, np.pi))
+    watchdog: float = field(0.02, at_least=0.001)
+    watchdog_kd: float = field(5.0, at_least=0.0, at_most=50.0)
+    fall_tilt: float = field(1.0, at_least=0.1, at_most=np.pi)
 
     def __attrs_post_init__(self) -> None:
         if self.world is not None and self.terrain.kind != "flat":

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from quadvel_description.arrays import Array
-from quadvel_sim.checks import number, numbers, whole_number
+from quadvel_description.fields import field
 
 LASER_VISIBLE_GROUP = 2
 """MuJoCo group of the geoms that a laser sees; links of the robot and low patches are in others."""
@@ -96,16 +96,16 @@ class Laser:
         mixed: Share of the rays at an edge that measure a mixed range.
     """
 
-    position: Array = attrs.field(default=(0.25, 0.0, 0.09), **numbers(3))
-    rotation: Array = attrs.field(default=0.0, **numbers(3))
-    field_of_view: float = attrs.field(default=270.0, **number(1.0, 360.0))
-    rays: int = attrs.field(default=1080, **whole_number(2))
-    rate: float = attrs.field(default=20.0, **number(10.0, 40.0))
-    range_max: float = attrs.field(default=25.0, **number(0.5, 200.0))
-    noise: float = attrs.field(default=0.01, **number(0.0, 1.0))
-    noise_share: float = attrs.field(default=0.001, **number(0.0, 0.1))
-    lost: float = attrs.field(default=0.002, **number(0.0, 1.0))
-    mixed: float = attrs.field(default=0.3, **number(0.0, 1.0))
+    position: Array = field((0.25, 0.0, 0.09), size=3)
+    rotation: Array = field(0.0, size=3)
+    field_of_view: float = field(270.0, at_least=1.0, at_most=360.0)
+    rays: int = field(1080, at_least=2, whole=True)
+    rate: float = field(20.0, at_least=10.0, at_most=40.0)
+    range_max: float = field(25.0, at_least=0.5, at_most=200.0)
+    noise: float = field(0.01, at_least=0.0, at_most=1.0)
+    noise_share: float = field(0.001, at_least=0.0, at_most=0.1)
+    lost: float = field(0.002, at_least=0.0, at_most=1.0)
+    mixed: float = field(0.3, at_least=0.0, at_most=1.0)
 
     def __attrs_post_init__(self) -> None:
         if not np.isclose(1000.0 / self.rate, self.period):

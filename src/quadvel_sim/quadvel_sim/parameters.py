@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import attrs
 import numpy as np
 from typing_extensions import override
 
 from quadvel_actuator import ActuatorParameters
+from quadvel_description.fields import field
 from quadvel_driver.calibration import Calibration
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_sim.bad_network import NetworkConfig
@@ -21,11 +20,6 @@ from quadvel_sim.world import SHIPPED_WORLDS, World
 _NOISE, _TERRAIN, _CONFIG = SensorNoise(), Terrain(), SimulatorConfig()
 
 
-def _parameter(default: Any, description: str) -> Any:
-    """Return an attrs field of a node parameter."""
-    return attrs.field(default=default, metadata={"description": description})
-
-
 @attrs.frozen(kw_only=True, slots=False)  # no slots: a subclass has a second base class
 class PlantParameters(Scheduling):
     """Parameters of the simulated robot and its ground.
@@ -36,34 +30,34 @@ class PlantParameters(Scheduling):
         ValueError: `state_rate` is no divisor of 1000 Hz or below 50 Hz.
     """
 
-    keyframe: str = _parameter("lie", "posture at the start: lie or stand")
-    state_rate: int = _parameter(200, "rate of the states, Hz: a divisor of 1000, 50 at least")
-    publish_tf: bool = _parameter(False, "whether to publish the true transform from odom to base_link")
-    seed: int = _parameter(_CONFIG.seed, "seed of sensor and torque noise")
-    actuator_file: str = _parameter("", "actuator model, YAML; empty: the shipped AlienGo")
-    world: str = _parameter(
+    keyframe: str = field("lie", "posture at the start: lie or stand")
+    state_rate: int = field(200, "rate of the states, Hz: a divisor of 1000, 50 at least")
+    publish_tf: bool = field(False, "whether to publish the true transform from odom to base_link")
+    seed: int = field(_CONFIG.seed, "seed of sensor and torque noise")
+    actuator_file: str = field("", "actuator model, YAML; empty: the shipped AlienGo")
+    world: str = field(
         "", f"world around the robot: a YAML file, or {', '.join(SHIPPED_WORLDS)}; empty: none"
     )
-    terrain: str = _parameter(_TERRAIN.kind, f"the ground: {', '.join(KINDS)}")
-    slope: float = _parameter(_TERRAIN.slope, "inclination of the ground, rad, rising along x")
-    roughness: float = _parameter(_TERRAIN.roughness, "rough ground: bound of its heights, m")
-    wavelength: float = _parameter(_TERRAIN.wavelength, "rough ground: distance from hump to hollow, m")
-    terrain_seed: int = _parameter(_TERRAIN.seed, "rough ground: its seed")
-    friction: tuple[float, ...] = _parameter(
+    terrain: str = field(_TERRAIN.kind, f"the ground: {', '.join(KINDS)}")
+    slope: float = field(_TERRAIN.slope, "inclination of the ground, rad, rising along x")
+    roughness: float = field(_TERRAIN.roughness, "rough ground: bound of its heights, m")
+    wavelength: float = field(_TERRAIN.wavelength, "rough ground: distance from hump to hollow, m")
+    terrain_seed: int = field(_TERRAIN.seed, "rough ground: its seed")
+    friction: tuple[float, ...] = field(
         tuple(_CONFIG.friction.tolist()), "sliding friction of the feet: one number, or FR, FL, RR, RL"
     )
-    payload: float = _parameter(_CONFIG.payload, "mass on the trunk, kg; negative: a lighter trunk")
-    payload_position: tuple[float, ...] = _parameter(
+    payload: float = field(_CONFIG.payload, "mass on the trunk, kg; negative: a lighter trunk")
+    payload_position: tuple[float, ...] = field(
         tuple(_CONFIG.payload_position.tolist()), "centre of that mass in the trunk frame, m"
     )
-    hung: bool = _parameter(_CONFIG.suspended, "whether the trunk is held in the air, as on a stand")
-    watchdog: float = _parameter(_CONFIG.watchdog, "s without a command after which the drives brake")
-    watchdog_kd: float = _parameter(_CONFIG.watchdog_kd, "gain of that brake, N m s/rad")
-    noise_q: float = _parameter(_NOISE.q, "standard deviation of q, rad")
-    noise_dq: float = _parameter(_NOISE.dq, "standard deviation of dq, rad/s")
-    noise_angular_velocity: float = _parameter(_NOISE.angular_velocity, "of the gyroscope, rad/s")
-    noise_linear_acceleration: float = _parameter(_NOISE.linear_acceleration, "of the accelerometer, m/s^2")
-    noise_orientation: float = _parameter(_NOISE.orientation, "of the orientation, rad an axis")
+    hung: bool = field(_CONFIG.suspended, "whether the trunk is held in the air, as on a stand")
+    watchdog: float = field(_CONFIG.watchdog, "s without a command after which the drives brake")
+    watchdog_kd: float = field(_CONFIG.watchdog_kd, "gain of that brake, N m s/rad")
+    noise_q: float = field(_NOISE.q, "standard deviation of q, rad")
+    noise_dq: float = field(_NOISE.dq, "standard deviation of dq, rad/s")
+    noise_angular_velocity: float = field(_NOISE.angular_velocity, "of the gyroscope, rad/s")
+    noise_linear_acceleration: float = field(_NOISE.linear_acceleration, "of the accelerometer, m/s^2")
+    noise_orientation: float = field(_NOISE.orientation, "of the orientation, rad an axis")
 
     def __attrs_post_init__(self) -> None:
         if not 50 <= self.state_rate <= 1000 or 1000 % self.state_rate:
@@ -150,15 +144,15 @@ class SimParameters(PlantParameters):
         ValueError: A mode or a timeout is out of its range.
     """
 
-    mode: str = _parameter("realtime", f"how time passes: {', '.join(MODES)}; lockstep waits for each LowCmd")
-    answer_timeout: float = _parameter(
+    mode: str = field(
+        "realtime", f"how time passes: {', '.join(MODES)}; lockstep waits for each LowCmd", one_of=MODES
+    )
+    answer_timeout: float = field(
         1.0, "s that simulated time waits for an answer; lockstep then sends the state again"
     )
 
     def __attrs_post_init__(self) -> None:
         super().__attrs_post_init__()
-        if self.mode not in MODES:
-            raise ValueError(f"mode is {self.mode!r}, expected one of {', '.join(MODES)}")
         if not 0.0 < self.answer_timeout < 3600.0:
             raise ValueError(f"answer_timeout is {self.answer_timeout} s, expected a time above 0")
 
@@ -175,11 +169,11 @@ class SimParameters(PlantParameters):
 class BoardParameters(PlantParameters, NetworkConfig):
     """Parameters of the node `board`: address and network faults."""
 
-    state_rate: int = _parameter(1000, "rate of the states, Hz: a divisor of 1000, 50 at least")
-    address: str = _parameter("127.0.0.1", "IP address on which the board listens")
-    port: int = _parameter(8007, "UDP port on which the board listens; 0: any that is free")
-    joint_zeros: tuple[float, ...] = _parameter(12 * (0.0,), "reading of the encoders at zero, rad")
-    imu_mounting: tuple[float, ...] = _parameter((0.0, 0.0), "tilt of the IMU about x and y, rad")
+    state_rate: int = field(1000, "rate of the states, Hz: a divisor of 1000, 50 at least")
+    address: str = field("127.0.0.1", "IP address on which the board listens")
+    port: int = field(8007, "UDP port on which the board listens; 0: any that is free")
+    joint_zeros: tuple[float, ...] = field(12 * (0.0,), "reading of the encoders at zero, rad")
+    imu_mounting: tuple[float, ...] = field((0.0, 0.0), "tilt of the IMU about x and y, rad")
 
     def calibration(self) -> Calibration:
         """Create the calibration errors of the simulated sensors.

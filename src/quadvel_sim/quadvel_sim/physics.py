@@ -10,7 +10,7 @@ import attrs
 import mujoco
 
 from quadvel_description import robot
-from quadvel_sim.checks import number, whole_number
+from quadvel_description.fields import field
 
 CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
 
@@ -30,13 +30,13 @@ class Physics:
         mass: Factor of the mass of every link.
     """
 
-    substeps: int = attrs.field(default=1, **whole_number())
-    cone: str = attrs.field(default="elliptic", validator=attrs.validators.in_(CONES))
-    contact_time: float = attrs.field(default=0.01, **number(0.002, 0.1))
-    contact_damping: float = attrs.field(default=1.0, **number(0.1, 5.0))
-    torsional_friction: float = attrs.field(default=0.0, **number(0.0, 0.1))
-    inertia: float = attrs.field(default=1.0, **number(0.5, 2.0))
-    mass: float = attrs.field(default=1.0, **number(0.5, 2.0))
+    substeps: int = field(1, at_least=0, whole=True)
+    cone: str = field("elliptic", one_of=CONES)
+    contact_time: float = field(0.01, at_least=0.002, at_most=0.1)
+    contact_damping: float = field(1.0, at_least=0.1, at_most=5.0)
+    torsional_friction: float = field(0.0, at_least=0.0, at_most=0.1)
+    inertia: float = field(1.0, at_least=0.5, at_most=2.0)
+    mass: float = field(1.0, at_least=0.5, at_most=2.0)
 
     def apply(self, model: mujoco.MjModel) -> None:
         """Apply the settings to a compiled model of the robot.

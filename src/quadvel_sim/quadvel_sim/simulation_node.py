@@ -22,7 +22,7 @@ from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker
 
-from quadvel_description.frames import BASE, ODOM, Placed
+from quadvel_description.frames import BASE, ODOM, FramePose
 from quadvel_description.state import RobotState
 from quadvel_msgs.srv import Push, ResetSim, StepSim
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
@@ -197,7 +197,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         fill_vector(message.twist.twist.angular, truth.angular_velocity)
         self._truth.publish(message)
         if transform:
-            base = Placed(ODOM, BASE, truth.position, truth.quaternion)
+            base = FramePose(ODOM, BASE, truth.position, truth.quaternion)
             self._tf.publish(TFMessage(transforms=transform_messages(stamp, [base])))
 
     # In the executor's thread.

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadvel_description.arrays import Array
-from quadvel_sim.checks import number, whole_number
+from quadvel_description.fields import field
 
 KINDS = ("flat", "slope", "rough")
 GEOM_NAME = "ground"
@@ -78,13 +78,13 @@ class Terrain:
     """
 
     kind: str = attrs.field(default="flat")
-    slope: float = attrs.field(default=0.0, **number(-0.8, 0.8))
-    roughness: float = attrs.field(default=0.06, **number(0.001, 1.0))
-    wavelength: float = attrs.field(default=0.6, **number(0.1, 10.0))
-    hills: float = attrs.field(default=0.0, **number(0.0, 10.0))
-    blend: float = attrs.field(default=0.5, **number(0.1, 100.0))
-    size: float = attrs.field(default=40.0, **number(4.0, 200.0))
-    seed: int = attrs.field(default=0, **whole_number())
+    slope: float = field(0.0, at_least=-0.8, at_most=0.8)
+    roughness: float = field(0.06, at_least=0.001, at_most=1.0)
+    wavelength: float = field(0.6, at_least=0.1, at_most=10.0)
+    hills: float = field(0.0, at_least=0.0, at_most=10.0)
+    blend: float = field(0.5, at_least=0.1, at_most=100.0)
+    size: float = field(40.0, at_least=4.0, at_most=200.0)
+    seed: int = field(0, at_least=0, whole=True)
 
     def __attrs_post_init__(self) -> None:
         if self.kind not in KINDS:

@@ -6,10 +6,9 @@ parts of a world; `surroundings` and `persons` simulate what changes with time.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import attrs
 import mujoco
@@ -17,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadvel_description.arrays import Array
-from quadvel_description.bounded_yaml import read_yaml
-from quadvel_sim.checks import whole_number
+from quadvel_description.fields import field
+from quadvel_description.records import read_document, structure_record
 from quadvel_sim.laser import Laser
 from quadvel_sim.terrain import GEOM_NAME
 from quadvel_sim.world_parts import Box, Hill, Patch, Person, Table, Trees, Wall, add_geom, planar_rotation
@@ -31,17 +30,6 @@ MAX_SOLIDS = 2_000
 MAX_PERSONS = 50
 MAX_HEIGHT_POINTS = 4_000_000
 """Largest number of height points of all patches: 100 m x 100 m."""
-
-
-_PARTS: Mapping[str, type] = {
-    "walls": Wall,
-    "boxes": Box,
-    "trees": Trees,
-    "tables": Table,
-    "patches": Patch,
-    "hills": Hill,
-    "persons": Person,
-}
 
 
 @attrs.frozen(eq=False, kw_only=True)
@@ -65,7 +53,7 @@ class World:
     """
 
     name: str = "world"
-    seed: int = attrs.field(default=0, **whole_number())
+    seed: int = field(0, at_least=0, whole=True)
     laser: Laser = attrs.field(factory=Laser)
     walls: Sequence[Wall] = ()
     boxes: Sequence[Box] = ()
@@ -118,16 +106,13 @@ class World:
         """
         path = WORLDS_FOLDER / f"{source}.yaml" if str(source) in SHIPPED_WORLDS else Path(source)
         try:
-            document = read_yaml(path, "a YAML file of a world")
+            content = read_document(path, "a YAML file of a world", SCHEMA)
         except OSError as error:
             shipped = ", ".join(SHIPPED_WORLDS)
             raise ValueError(
                 f"world {source}: {error.strerror}, expected a YAML file or one of {shipped}"
             ) from None
-        try:
-            return _parse_world(document, path.stem)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+        return structure_record(cls, {"name": path.stem, **content}, path)
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Compute the height of the ground without the bumps of patches.
@@ -179,45 +164,3 @@ class World:
             patch.add_to(spec, f"patch_{i}", self.seed + 1 + i)
         for i, hill in enumerate(self.hills):
             hill.add_to(spec, f"hill_{i}")
-
-
-def _parse_world(document: object, name: str) -> World:
-    """Return the world of a YAML document."""
-    fields = dict(_require_mapping(document, "the file"))
-    schema = fields.pop("schema", None)
-    if schema != SCHEMA or isinstance(schema, bool):
-        raise ValueError(f"schema: found {schema!r}, expected {SCHEMA}")
-    for kind, record in _PARTS.items():
-        if kind in fields:
-            rows = fields[kind]
-            if not isinstance(rows, list):
-                raise ValueError(f"{kind}: found {rows!r}, expected a list")
-            fields[kind] = tuple(_make_record(record, row, f"{kind}[{i}]") for i, row in enumerate(rows))
-    if "laser" in fields:
-        fields["laser"] = _make_record(Laser, fields["laser"], "laser")
-    return _make_record(World, {"name": name, **fields}, "the file")
-
-
-def _make_record(record: type, fields: object, where: str) -> Any:
-    """Return a record from a mapping; errors name the place in the file."""
-    given = _require_mapping(fields, where)
-    known = {field.name: field for field in attrs.fields(record)}
-    for key in given:
-        if key not in known:
-            raise ValueError(f"{where}: found the field {key!r}, expected one of {', '.join(known)}")
-    for key, field in known.items():
-        if field.default is attrs.NOTHING and key not in given:
-            raise ValueError(f"{where}: found no field {key!r}, expected one")
-    try:
-        return record(**given)
-    except TypeError as error:  # text instead of a number
-        raise ValueError(f"{where}: {error}") from None
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}" if record is not World else str(error)) from None
-
-
-def _require_mapping(value: object, where: str) -> Mapping[str, Any]:
-    """Return the value if it is a mapping, else raise ValueError."""
-    if not isinstance(value, Mapping):
-        raise ValueError(f"{where}: found {value!r}, expected fields with their values")
-    return value

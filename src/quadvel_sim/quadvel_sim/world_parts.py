@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, TypeAlias
 
 import attrs
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadvel_description.arrays import Array
-from quadvel_sim.checks import number, numbers, one_of, or_none, points, truth_value
+from quadvel_description.fields import field, refusal, to_array
 from quadvel_sim.laser import LASER_VISIBLE_GROUP
 from quadvel_sim.terrain import perlin
 
@@ -40,6 +40,19 @@ _RGBA = {
     "tree": (0.36, 0.26, 0.17, 1.0),
     "table": (0.6, 0.48, 0.34, 1.0),
 }
+
+
+def _points(minimum: int) -> Any:
+    """Declare a read-only array of points, (n, 2); no point follows itself."""
+
+    def check(record: object, attribute: attrs.Attribute[Any], value: Any) -> None:
+        shape = np.shape(value) if isinstance(value, np.ndarray) else ()
+        if len(shape) != 2 or shape[0] < minimum or shape[1] != 2 or not np.isfinite(value).all():
+            raise refusal(record, attribute.name, value, f"{minimum} or more points [x, y]")
+        if minimum > 1 and not np.hypot(*np.diff(value, axis=0).T).all():
+            raise refusal(record, attribute.name, value, "no point twice in a row")
+
+    return attrs.field(converter=partial(to_array, None), validator=check)
 
 
 @attrs.frozen
@@ -74,9 +87,9 @@ class Wall:
         thickness: Thickness, m.
     """
 
-    points: Array = attrs.field(**points(2))
-    height: float = attrs.field(default=2.5, **number(0.05, 50.0))
-    thickness: float = attrs.field(default=0.1, **number(0.01, 5.0))
+    points: Array = _points(2)
+    height: float = field(2.5, at_least=0.05, at_most=50.0)
+    thickness: float = field(0.1, at_least=0.01, at_most=5.0)
 
     def add_to(self, spec: mujoco.MjSpec, name: str, height: Height) -> None:
         """Add a box per segment; boxes overlap at the corners.
@@ -104,9 +117,9 @@ class Box:
         yaw: Orientation, deg.
     """
 
-    position: Array = attrs.field(**numbers(2))
-    size: Array = attrs.field(**numbers(3, low=0.01))
-    yaw: float = attrs.field(default=0.0, **number(-360.0, 360.0))
+    position: Array = field(size=2)
+    size: Array = field(size=3, at_least=0.01)
+    yaw: float = field(0.0, at_least=-360.0, at_most=360.0)
 
     def add_to(self, spec: mujoco.MjSpec, name: str, height: Height) -> None:
         """Add a box.
@@ -130,9 +143,9 @@ class Trees:
         height: Height, m.
     """
 
-    positions: Array = attrs.field(**points(1))
-    radius: float = attrs.field(default=0.15, **number(0.01, 3.0))
-    height: float = attrs.field(default=3.0, **number(0.05, 50.0))
+    positions: Array = _points(1)
+    radius: float = field(0.15, at_least=0.01, at_most=3.0)
+    height: float = field(3.0, at_least=0.05, at_most=50.0)
 
     def add_to(self, spec: mujoco.MjSpec, name: str, height: Height) -> None:
         """Add a cylinder per trunk.
@@ -158,10 +171,10 @@ class Table:
         yaw: Orientation, deg.
     """
 
-    position: Array = attrs.field(**numbers(2))
-    size: Array = attrs.field(default=(1.4, 0.7), **numbers(2, low=0.1))
-    height: float = attrs.field(default=0.74, **number(0.1, 3.0))
-    yaw: float = attrs.field(default=0.0, **number(-360.0, 360.0))
+    position: Array = field(size=2)
+    size: Array = field((1.4, 0.7), size=2, at_least=0.1)
+    height: float = field(0.74, at_least=0.1, at_most=3.0)
+    yaw: float = field(0.0, at_least=-360.0, at_most=360.0)
 
     def add_to(self, spec: mujoco.MjSpec, name: str, height: Height) -> None:
         """Add four cylinders and a box.
@@ -207,12 +220,12 @@ class Patch:
         bumps: Height of the bumps, m; None: that of the surface.
     """
 
-    surface: str = attrs.field(**one_of(["grass", "gravel"]))
-    position: Array = attrs.field(**numbers(2))
-    size: Array = attrs.field(**numbers(2, low=0.5))
-    yaw: float = attrs.field(default=0.0, **number(-360.0, 360.0))
-    friction: float | None = attrs.field(default=None, **or_none(number(0.05, 3.0)))
-    bumps: float | None = attrs.field(default=None, **or_none(number(0.006, 0.2)))
+    surface: str = field(one_of=["grass", "gravel"])
+    position: Array = field(size=2)
+    size: Array = field(size=2, at_least=0.5)
+    yaw: float = field(0.0, at_least=-360.0, at_most=360.0)
+    friction: float | None = field(None, at_least=0.05, at_most=3.0)
+    bumps: float | None = field(None, at_least=0.006, at_most=0.2)
 
     def add_to(self, spec: mujoco.MjSpec, name: str, seed: int) -> None:
         """Add a height field.
@@ -281,13 +294,13 @@ class Hill:
         surface: Surface that sets friction and colour.
     """
 
-    position: Array = attrs.field(**numbers(2))
-    size: Array = attrs.field(**numbers(2, low=1.0))
-    height: float = attrs.field(**number(0.02, 20.0))
-    slope: float = attrs.field(**number(1.0, MAX_HILL_SLOPE_DEG))
-    sides: float | None = attrs.field(default=None, **or_none(number(1.0, 60.0)))
-    yaw: float = attrs.field(default=0.0, **number(-360.0, 360.0))
-    surface: str = attrs.field(default="paved", **one_of(list(SURFACES)))
+    position: Array = field(size=2)
+    size: Array = field(size=2, at_least=1.0)
+    height: float = field(at_least=0.02, at_most=20.0)
+    slope: float = field(at_least=1.0, at_most=MAX_HILL_SLOPE_DEG)
+    sides: float | None = field(None, at_least=1.0, at_most=60.0)
+    yaw: float = field(0.0, at_least=-360.0, at_most=360.0)
+    surface: str = field("paved", one_of=list(SURFACES))
 
     def __attrs_post_init__(self) -> None:
         highest = 0.98 * float((0.5 * self.size * self.steepness).min())
@@ -356,17 +369,17 @@ class Person:
         apart: Lateral distance between the legs, m.
     """
 
-    way: Array = attrs.field(**points(2))
-    closed: bool = attrs.field(default=False, **truth_value())
-    led: bool = attrs.field(default=False, **truth_value())
-    speed: float = attrs.field(default=1.2, **number(0.1, 3.0))
-    pace: float = attrs.field(default=0.0, **number(0.0, 0.9))
+    way: Array = _points(2)
+    closed: bool = False
+    led: bool = False
+    speed: float = field(1.2, at_least=0.1, at_most=3.0)
+    pace: float = field(0.0, at_least=0.0, at_most=0.9)
     speeds: Sequence[Sequence[float]] = ()
     stops: Sequence[Sequence[float]] = ()
-    begins_at: float = attrs.field(default=0.0, **number(0.0))
-    turn: float = attrs.field(default=0.8, **number(0.0, 20.0))
-    radius: float = attrs.field(default=0.06, **number(0.03, 0.15))
-    apart: float = attrs.field(default=0.2, **number(0.1, 0.5))
+    begins_at: float = field(0.0, at_least=0.0)
+    turn: float = field(0.8, at_least=0.0, at_most=20.0)
+    radius: float = field(0.06, at_least=0.03, at_most=0.15)
+    apart: float = field(0.2, at_least=0.1, at_most=0.5)
 
     def __attrs_post_init__(self) -> None:
         for name, least in (("speeds", 0.1), ("stops", 0.0)):

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
-from quadvel_description.frames import BASE, LASER, ODOM, Placed
+from quadvel_description.frames import BASE, LASER, ODOM, FramePose
 from quadvel_nodes.robot_view import LATCHED, transform_messages
 from quadvel_sim.simulator import Simulator
 from quadvel_sim.world import World
@@ -30,7 +30,7 @@ class WorldView:
         self._scan = node.create_publisher(LaserScan, "scan", 10)
         self._persons = node.create_publisher(PoseArray, "ground_truth/persons", 10)
         self._static = node.create_publisher(TFMessage, "/tf_static", LATCHED)
-        mounted = Placed(BASE, LASER, laser.position, laser.quaternion)
+        mounted = FramePose(BASE, LASER, laser.position, laser.quaternion)
         self._static.publish(
             TFMessage(transforms=transform_messages(node.get_clock().now().to_msg(), [mounted]))
         )

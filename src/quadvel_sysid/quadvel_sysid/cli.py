@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Any
 
 import attrs
@@ -20,6 +19,7 @@ from typer.core import TyperCommand
 from typing_extensions import override
 
 from quadvel_actuator.parameters import ActuatorParameters
+from quadvel_recordings.output import output_folder
 
 from .logs.check_log import CheckedLog, check_logs
 from .logs.log import Log
@@ -163,7 +163,7 @@ def identify(
     """
     messages = Console(stderr=True)
     try:
-        _check_folder(out)
+        output_folder(out)
         return_large_arrays()
         names = ColumnMap() if columns is None else ColumnMap.load(columns)
         read = partial(read_log, joints=joints, names=names, topics=Topics(state_topic, command_topic))
@@ -279,17 +279,6 @@ def print_findings(checked: CheckedLog, messages: Console) -> None:
     for finding in checked.findings:
         line = f"  {finding.kind:8} {finding.text}"
         messages.print(escape(line), style=STYLE[finding.kind], soft_wrap=True, highlight=False)
-
-
-def _check_folder(out: Path) -> None:
-    """Raise OSError if `out` cannot become a writable folder; the test file is deleted."""
-    there = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
-    if not there.is_dir():
-        raise NotADirectoryError(f"{out}: is a file or lies below one, expected a folder")
-    try:
-        TemporaryFile(dir=there).close()
-    except OSError as error:
-        raise type(error)(f"{out}: the folder is not writable: {error.strerror}") from None
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from foxglove.websocket import ServerListener
 
 from quadvel_recordings.definitions import STORE
 
-from .guard import is_loopback
+from .access_control import is_loopback
 from .server import AddressError
 
 DEFAULT_PORT = 8765

@@ -8,9 +8,9 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 
 from .operator import Operator
+from .page_protocol import Pace, PageMessage, Play, Seek
 from .playback import Playback
 from .viewer import FRAME_PERIOD_S, Viewer
-from .words import Pace, PageMessage, Play, Seek
 
 
 def replay(

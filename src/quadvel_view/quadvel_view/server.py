@@ -33,8 +33,8 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from . import scene_server
-from .guard import AccessControl, RequestError, Visitor, is_loopback
-from .words import MAX_MESSAGE_BYTES, PageMessage, PageMessageError, parse_message
+from .access_control import AccessControl, RequestError, Visitor, is_loopback
+from .page_protocol import MAX_MESSAGE_BYTES, PageMessage, PageMessageError, parse_message
 
 COOKIE = "quadvel_view"
 """Prefix of the name of the token's cookie.

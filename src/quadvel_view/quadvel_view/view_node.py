@@ -20,17 +20,18 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 
+from quadvel_description.fields import field
 from quadvel_msgs.srv import Push, ResetSim, SetMode
 from quadvel_nodes.node import StartError, read_parameters, run
 from quadvel_recordings.definitions import STORE
 
 from .operator import PUBLISH_PERIOD_S, Operator
+from .page_protocol import Allow, Hold, LetGo, ModeRequest, PageMessage, Record, Release, Reset, Stop
+from .page_protocol import Push as PushWord
 from .picture import LATCHED, TOPICS, RobotPicture
 from .recording import PageRecorder
 from .server import AddressError
 from .viewer import DEFAULT_PORT, FRAME_PERIOD_S, MAX_PORT, Viewer
-from .words import Allow, Hold, LetGo, ModeRequest, PageMessage, Record, Release, Reset, Stop
-from .words import Push as PushWord
 
 LATCHED_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATEST_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -39,11 +40,6 @@ PUSH_FORCE_N, PUSH_DURATION_S = 60.0, 0.2
 """Force of the page's push, N."""
 SLOPE_RAD = 0.175
 """Inclination of the terrain "slope" of the page."""
-
-
-def _parameter(default: Any, description: str) -> Any:
-    """Declare a node parameter with its default value and description."""
-    return attrs.field(default=default, metadata={"description": description})
 
 
 @attrs.frozen
@@ -56,15 +52,13 @@ class ViewParameters:
         record_folder: Folder for recordings.
     """
 
-    host: str = _parameter(
+    host: str = field(
         "127.0.0.1", "address on which the page is served; others than this host's need the token"
     )
-    port: int = _parameter(DEFAULT_PORT, "TCP port of the page; 0: any that is free")
-    record_folder: str = _parameter("out", "folder for recordings that the page starts")
-
-    def __attrs_post_init__(self) -> None:
-        if not 0 <= self.port <= MAX_PORT:
-            raise ValueError(f"port is {self.port}, expected 0 to {MAX_PORT}")
+    port: int = field(
+        DEFAULT_PORT, "TCP port of the page; 0: any that is free", at_least=0, at_most=MAX_PORT, whole=True
+    )
+    record_folder: str = field("out", "folder for recordings that the page starts")
 
 
 class View(Node):

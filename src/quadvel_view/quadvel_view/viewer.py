@@ -6,12 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 from .operator import Operator
+from .page_protocol import PageMessage
 from .panel import panel
 from .picture import RobotPicture
 from .scene import Scene
 from .scene_server import SceneServer, SceneServerError
 from .server import AddressError, PageServer
-from .words import PageMessage
 
 FRAME_PERIOD_S = 1.0 / 30.0
 """Time between two frames."""

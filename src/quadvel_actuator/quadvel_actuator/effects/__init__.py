@@ -25,7 +25,8 @@ from .base import (
 GROUP = "quadvel.effects"
 
 __all__ = [
-    "DRIVE", "JOINT", "AddedEffect", "EffectModel", "ErrorEffect", "MemoryEffect", "Parameter", "Stage", "TorqueEffect", "registry",
+    "DRIVE", "JOINT", "AddedEffect", "EffectModel", "ErrorEffect", "MemoryEffect", "Parameter", "Stage", "TorqueEffect",
+    "registry",
 ]  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from quadvel_recordings.output import replacing
+from quadvel_recordings.output import atomic_write
 
 from ..report import write_json
 from .campaign import (
@@ -50,9 +50,9 @@ def write_campaign(folder: Path, runs: Sequence[FaultRun]) -> dict[str, Any]:
         "runs": [attrs.asdict(run) for run in runs],
     }
     write_json(folder / "faults.json", result)
-    with replacing(folder / "faults.md") as draft:
+    with atomic_write(folder / "faults.md") as draft:
         draft.write_text(markdown(entries))
-    with replacing(folder / "faults.png") as draft:
+    with atomic_write(folder / "faults.png") as draft:
         reaction_time_figure(entries).savefig(draft, dpi=150)
     return result
 

@@ -23,9 +23,9 @@ from quadvel_estimator.learned import LearnedEstimator
 from quadvel_estimator.tracker import VelocityTracker
 from quadvel_nodes.messages import (
     MessageError,
-    numbers,
     read_low_cmd,
     read_low_state,
+    read_numbers,
     seconds,
     write_low_cmd,
     write_low_state,
@@ -250,7 +250,7 @@ class Stack:
         """Controller: take a velocity estimate."""
         self._to_controller(
             "velocity_estimate",
-            lambda: self._loop.on_velocity(seconds(message.stamp), numbers(message, "velocity", 3)),
+            lambda: self._loop.on_velocity(seconds(message.stamp), read_numbers(message, "velocity", 3)),
         )
 
     def _command_to_controller(self, message: Message) -> None:
@@ -258,7 +258,7 @@ class Stack:
         self._to_controller(
             "command",
             lambda: self._loop.on_command(
-                seconds(message.stamp), numbers(message, "velocity", 3), message.stance
+                seconds(message.stamp), read_numbers(message, "velocity", 3), message.stance
             ),
         )
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from quadvel_nodes.number_text import number_text
-from quadvel_recordings.output import output_folder, replacing
+from quadvel_recordings.output import atomic_write, output_folder
 
 from .measure import measure_scenes
 
@@ -40,6 +40,6 @@ def following_command(
     for name, row in found.items():
         table.add_row(name, *(number_text(row[head], ".2f") for head in HEADS))
     Console().print(table)
-    with replacing(out / "following.json") as draft:
+    with atomic_write(out / "following.json") as draft:
         draft.write_text(json.dumps(found, indent=1))
     print(f"written: {out}/following.json")

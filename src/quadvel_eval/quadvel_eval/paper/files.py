@@ -17,7 +17,7 @@ import attrs
 from matplotlib.figure import Figure
 
 from quadvel_policy.policy_file import PolicyFile
-from quadvel_recordings.output import replacing
+from quadvel_recordings.output import atomic_write
 
 from ..report import read_json, write_figure, write_json
 from .section import Record, Row, Section, Study, distinct
@@ -105,7 +105,7 @@ def write_records(path: Path, records: Sequence[Record]) -> None:
         path: The file.
         records: The records.
     """
-    with replacing(path) as draft, draft.open("w", newline="") as file:
+    with atomic_write(path) as draft, draft.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(records[0]) if records else [], lineterminator="\n")
         writer.writeheader()
         for record in records:
@@ -163,7 +163,7 @@ def write_page(folder: Path, sections: Sequence[Section]) -> None:
     ]
     for section in there:
         lines += _chapter(section, rows[section], read_json(folder / f"{section.name}.json"))
-    with replacing(folder / PAGE_FILE) as draft:
+    with atomic_write(folder / PAGE_FILE) as draft:
         draft.write_text("\n".join(lines))
 
 

@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_description.robot import JOINT_NAMES
-from quadvel_recordings.output import replacing
+from quadvel_recordings.output import atomic_write
 
 from .cells import Command, cell_record, command_limits, count_falls, largest_error, mean_error
 from .conditions import Condition, condition_job, draw_error_and_survival
@@ -78,7 +78,7 @@ def write_walk_log(policy: Path, plant: str, out: Path, seed: int = 0) -> None:
         study.setup("walker", **known[plant].plant), seed, command_limits(study, "walker")
     )
     fields = {name: getattr(log, name) for name in ("t", "q", "dq", "tau", "q_des", "tau_ff", "kp", "kd")}
-    with replacing(out) as draft:
+    with atomic_write(out) as draft:
         np.savez_compressed(draft, joint_names=np.array(log.joints), **fields)
 
 

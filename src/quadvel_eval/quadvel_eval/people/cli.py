@@ -13,7 +13,7 @@ from rich.table import Table
 
 from quadvel_follow.leg_detector import SHIPPED_MODEL, LegDetector
 from quadvel_nodes.number_text import number_text
-from quadvel_recordings.output import output_folder, replacing
+from quadvel_recordings.output import atomic_write, output_folder
 
 from .figure import draw_tracks
 from .measure import ScanRecording, measure_files, measure_scenes
@@ -60,7 +60,7 @@ def people_command(
     if runs:
         found["scenes"] = measure_scenes(runs, detector)
         console.print(_table(f"simulated, {runs} each", found["scenes"]))
-    with replacing(out / "people.json") as draft:
+    with atomic_write(out / "people.json") as draft:
         draft.write_text(json.dumps(found, indent=1))
     console.print(f"written: {out}/people.json{', pictures' if scans is not None else ''}")
 

@@ -218,5 +218,5 @@ def effect_settings(effect: AppliedEffect) -> dict[str, Any]:
         name: [v for v, acts in zip(value, effect.active, strict=True) if acts]
         if isinstance(value, list)
         else value
-        for name, value in effect.candidate.settings.items()
+        for name, value in effect.candidate.effect.settings.items()
     }

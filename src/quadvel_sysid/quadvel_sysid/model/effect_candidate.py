@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Protocol
 import attrs
 import numpy as np
 
-from quadvel_actuator.effects import JOINT, EffectModel, Parameter, Stage
+from quadvel_actuator.effects import DRIVE, JOINT, EffectModel, Parameter, Stage
 from quadvel_actuator.effects.numerics import distinct_indices
 from quadvel_description.arrays import Array, Bools
 
@@ -56,6 +56,9 @@ class EffectCandidate:
         acts_between_rows: Whether it also depends on what happens between the rows of a log.
         all_joints_together: Whether it happens to all joints of a robot at the same time.
         motion: Motion to record in order to distinguish it from other effects.
+        settings_to_try: Settings of the forms to try on a log.
+        places: Where an added torque is tried.
+        guesses: Starting points of the parameters.
     """
 
     effect: EffectModel
@@ -63,6 +66,9 @@ class EffectCandidate:
     acts_between_rows: ClassVar[bool] = False
     all_joints_together: ClassVar[bool] = False
     motion: ClassVar[str] = "richer motion"
+    settings_to_try: ClassVar[Sequence[Mapping[str, str]]] = ({},)
+    places: ClassVar[Sequence[str]] = (DRIVE, JOINT)
+    guesses: ClassVar[Sequence[InitialGuess]] = ({},)
 
     @property
     def depends_on_commands(self) -> bool:
@@ -131,11 +137,6 @@ class EffectCandidate:
         return self.effect.has_memory
 
     @property
-    def settings(self) -> dict[str, Any]:
-        """Settings that are not the default."""
-        return self.effect.settings
-
-    @property
     def key(self) -> tuple[str, ...]:
         """Key by which candidates count as the same."""
         return (self.name,)
@@ -175,9 +176,8 @@ class EffectCandidate:
         Returns:
             Forms of the effect; empty where it cannot act.
         """
-        if effect.stage == Stage.ADDED:
-            return cls(effect()), cls(effect(at=JOINT))
-        return (cls(effect()),)
+        places = cls.places if effect.stage == Stage.ADDED else (DRIVE,)
+        return [cls(effect(**settings, at=at)) for settings in cls.settings_to_try for at in places]
 
     def initial_guesses(self, s: Signals, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         """List starting points for a search of the parameters.
@@ -191,7 +191,7 @@ class EffectCandidate:
         Returns:
             Guesses; a parameter that is left out starts from its scale.
         """
-        return [{}]
+        return self.guesses
 
     def special_case(self, p: Mapping[str, Array]) -> tuple[EffectCandidate, Mapping[str, Array]] | None:
         """Return the effect with fewer parameters that this one becomes in a limit.

@@ -397,7 +397,7 @@ def _structure_key(model: Model) -> tuple[object, ...]:
     effects = [
         (
             effect.candidate.name,
-            str(effect.candidate.settings),
+            str(effect.candidate.effect.settings),
             effect.active.tobytes(),
             effect.groups.tobytes(),
         )

@@ -2,23 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import attrs
 from typing_extensions import override
 
-from quadvel_actuator.effects import DRIVE, JOINT, EffectModel
-from quadvel_actuator.effects.dynamics import (
-    ACCELERATION_SIGNALS,
-    Armature,
-    FirstOrderLag,
-    TimestampSkew,
-    VelocityFilter,
-)
-from quadvel_description.arrays import Array
+from quadvel_actuator.effects import dynamics
 
-from ...data.signals import Signals
-from ...model.effect_candidate import EffectCandidate, FormContext, InitialGuess
+from ...model.effect_candidate import EffectCandidate
 
 _FAST_MOTION = "chirps up to 20 Hz and steps, small enough to stay below every bound"
 
@@ -29,10 +18,7 @@ class LagCandidate(EffectCandidate):
     signal = "tau@history"
     shifts = True
     motion = _FAST_MOTION
-
-    @override
-    def initial_guesses(self, s: Signals, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        return [{"T": time} for time in (0.001, 0.002, 0.004, 0.007, 0.012, 0.025)]
+    guesses = tuple({"T": time} for time in (0.001, 0.002, 0.004, 0.007, 0.012, 0.025))
 
 
 class VelocityFilterCandidate(EffectCandidate):
@@ -41,42 +27,42 @@ class VelocityFilterCandidate(EffectCandidate):
     signal = "dq@history"
     shifts = True
     motion = _FAST_MOTION
-
-    @override
-    def initial_guesses(self, s: Signals, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        return [{"T": time} for time in (0.001, 0.002, 0.004, 0.008, 0.015, 0.03)]
+    guesses = tuple({"T": time} for time in (0.001, 0.002, 0.004, 0.008, 0.015, 0.03))
 
 
 @attrs.frozen(eq=False)
 class ArmatureCandidate(EffectCandidate):
     """Rotor inertia, with each of the accelerations."""
 
-    effect: Armature
+    effect: dynamics.Armature
     linear = ("J",)
     signal = "ddq"
     shifts = True
     motion = _FAST_MOTION
-
-    @classmethod
-    @override
-    def forms(cls, effect: type[EffectModel], context: FormContext) -> Sequence[ArmatureCandidate]:
-        return tuple(cls(Armature(of=of, at=at)) for of in ACCELERATION_SIGNALS for at in (DRIVE, JOINT))
+    settings_to_try = tuple({"of": of} for of in dynamics.ACCELERATION_SIGNALS)
 
     @property
     @override
     def indistinguishable_forms(self) -> tuple[EffectCandidate, ...]:
-        own = self.effect.of, self.effect.at
-        every = ((of, at) for of in ACCELERATION_SIGNALS for at in (DRIVE, JOINT))
-        return tuple(ArmatureCandidate(Armature(of=of, at=at)) for of, at in every if (of, at) != own)
+        own = self.effect.of, self.at
+        every = ((of, at) for of in dynamics.ACCELERATION_SIGNALS for at in self.places)
+        return tuple(
+            ArmatureCandidate(dynamics.Armature(of=of, at=at)) for of, at in every if (of, at) != own
+        )
 
 
 @attrs.frozen(eq=False)
 class TimestampSkewCandidate(EffectCandidate):
     """Time skew of velocities or positions."""
 
-    effect: TimestampSkew
+    effect: dynamics.TimestampSkew
     shifts = True
     motion = _FAST_MOTION
+    settings_to_try = {"channel": "dq"}, {"channel": "q"}
+    guesses = tuple(
+        {"late": late}
+        for late in (-0.012, -0.008, -0.005, -0.003, -0.0015, 0.0015, 0.003, 0.005, 0.008, 0.012)
+    )
 
     @property
     @override
@@ -89,22 +75,10 @@ class TimestampSkewCandidate(EffectCandidate):
         """Whether skew on all joints equals two other delays, which holds for positions."""
         return self.effect.channel == "q"
 
-    @classmethod
-    @override
-    def forms(cls, effect: type[EffectModel], context: FormContext) -> Sequence[TimestampSkewCandidate]:
-        return cls(TimestampSkew("dq")), cls(TimestampSkew("q"))
-
-    @override
-    def initial_guesses(self, s: Signals, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        return [
-            {"late": late}
-            for late in (-0.012, -0.008, -0.005, -0.003, -0.0015, 0.0015, 0.003, 0.005, 0.008, 0.012)
-        ]
-
 
 CANDIDATES = {
-    FirstOrderLag: LagCandidate,
-    VelocityFilter: VelocityFilterCandidate,
-    Armature: ArmatureCandidate,
-    TimestampSkew: TimestampSkewCandidate,
+    dynamics.FirstOrderLag: LagCandidate,
+    dynamics.VelocityFilter: VelocityFilterCandidate,
+    dynamics.Armature: ArmatureCandidate,
+    dynamics.TimestampSkew: TimestampSkewCandidate,
 }

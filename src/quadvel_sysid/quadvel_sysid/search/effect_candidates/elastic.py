@@ -8,19 +8,11 @@ import attrs
 import numpy as np
 from typing_extensions import override
 
-from quadvel_actuator.effects import EffectModel
-from quadvel_actuator.effects.elastic import (
-    Backlash,
-    Cogging,
-    Deadband,
-    Hysteresis,
-    ParallelSpring,
-    TorqueOffset,
-)
+from quadvel_actuator.effects import DRIVE, elastic
 from quadvel_description.arrays import Array, Bools
 
 from ...data.signals import Signals
-from ...model.effect_candidate import EffectCandidate, FormContext, InitialGuess
+from ...model.effect_candidate import EffectCandidate, InitialGuess
 
 _STIFFNESSES = (-10.0, -3.0, -1.0, -0.4, 0.4, 1.0, 2.0, 4.0, 10.0, 30.0)  # N m/rad
 _SLOW_REVERSALS = "small slow reversals about many postures, each held for a second"
@@ -36,11 +28,7 @@ class OffsetCandidate(EffectCandidate):
         "a constant offset and an encoder bias differ only where kp changes: two recordings with different kp"
     )
     depends_on_commands = False
-
-    @classmethod
-    @override
-    def forms(cls, effect: type[EffectModel], context: FormContext) -> Sequence[EffectCandidate]:
-        return (cls(effect()),)
+    places = (DRIVE,)
 
 
 class SpringCandidate(EffectCandidate):
@@ -62,7 +50,7 @@ class SpringCandidate(EffectCandidate):
     @override
     def special_case(self, p: Mapping[str, Array]) -> tuple[EffectCandidate, Mapping[str, Array]]:
         """Return the constant torque k q0: a weak spring that rests far away."""
-        return OffsetCandidate(TorqueOffset(at=self.at)), {"offset": p["k"] * p["q0"]}
+        return OffsetCandidate(elastic.TorqueOffset(at=self.at)), {"offset": p["k"] * p["q0"]}
 
 
 class CoggingCandidate(EffectCandidate):
@@ -114,11 +102,7 @@ class DeadbandCandidate(EffectCandidate):
 
     signal = "q_des"
     motion = _SLOW_REVERSALS
-
-    @classmethod
-    @override
-    def forms(cls, effect: type[EffectModel], context: FormContext) -> Sequence[EffectCandidate]:
-        return cls(Deadband("soft")), cls(Deadband("hard"))
+    settings_to_try = {"edge": "soft"}, {"edge": "hard"}
 
     @override
     def initial_guesses(self, s: Signals, torque: Array, residual: Array) -> Sequence[InitialGuess]:
@@ -130,14 +114,10 @@ class DeadbandCandidate(EffectCandidate):
 class BacklashCandidate(EffectCandidate):
     """Backlash of the position, the error or the torque."""
 
-    effect: Backlash
+    effect: elastic.Backlash
     signal = "q@history"
     motion = _SLOW_REVERSALS
-
-    @classmethod
-    @override
-    def forms(cls, effect: type[EffectModel], context: FormContext) -> Sequence[EffectCandidate]:
-        return tuple(cls(Backlash(on)) for on in ("error", "q", "torque"))
+    settings_to_try = {"on": "error"}, {"on": "q"}, {"on": "torque"}
 
     @override
     def initial_guesses(self, s: Signals, torque: Array, residual: Array) -> Sequence[InitialGuess]:
@@ -165,10 +145,10 @@ def _rms(x: Array) -> Array:
 
 
 CANDIDATES = {
-    TorqueOffset: OffsetCandidate,
-    ParallelSpring: SpringCandidate,
-    Cogging: CoggingCandidate,
-    Deadband: DeadbandCandidate,
-    Backlash: BacklashCandidate,
-    Hysteresis: HysteresisCandidate,
+    elastic.TorqueOffset: OffsetCandidate,
+    elastic.ParallelSpring: SpringCandidate,
+    elastic.Cogging: CoggingCandidate,
+    elastic.Deadband: DeadbandCandidate,
+    elastic.Backlash: BacklashCandidate,
+    elastic.Hysteresis: HysteresisCandidate,
 }

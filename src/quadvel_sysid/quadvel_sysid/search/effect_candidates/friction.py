@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import attrs
 from typing_extensions import override
 
-from quadvel_actuator.effects.friction import (
-    CoulombFriction,
-    LoadDependentFriction,
-    QuadraticDrag,
-    SignFriction,
-    StribeckFriction,
-    ViscousFriction,
-)
+from quadvel_actuator.effects import friction
 from quadvel_description.arrays import Array
 
-from ...data.signals import Signals
-from ...model.effect_candidate import EffectCandidate, InitialGuess
+from ...model.effect_candidate import EffectCandidate
 
-_SIGN_WIDTHS_RAD_S = (0.02, 0.06, 0.2)
 _SLOW_REVERSALS = "slow reversals of every joint in the air, at speeds from 0.05 to 5 rad/s"
 
 
@@ -28,19 +19,16 @@ _SLOW_REVERSALS = "slow reversals of every joint in the air, at speeds from 0.05
 class _SignFrictionCandidate(EffectCandidate):
     """A log hardly shows the shape of the sign function, but the amplitude depends on it."""
 
-    effect: SignFriction
+    effect: friction.SignFriction
     signal = "dq"
     motion = _SLOW_REVERSALS
     depends_on_commands = False
+    guesses = tuple({"v_0": width} for width in (0.02, 0.06, 0.2))
 
     @property
     @override
     def indistinguishable_forms(self) -> tuple[EffectCandidate, ...]:
         return (attrs.evolve(self, effect=attrs.evolve(self.effect, turn="arctan")),)
-
-    @override
-    def initial_guesses(self, s: Signals, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        return [{"v_0": width} for width in _SIGN_WIDTHS_RAD_S]
 
 
 class CoulombCandidate(_SignFrictionCandidate):
@@ -63,14 +51,11 @@ class StribeckCandidate(_SignFrictionCandidate):
     """Stribeck friction."""
 
     linear = ("c", "c_s")
-
-    @override
-    def initial_guesses(self, s: Signals, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        return [{"v_s": v_s, "v_0": v_0} for v_s in (0.15, 0.4, 1.0, 2.0) for v_0 in (0.02, 0.08)]
+    guesses = tuple({"v_s": v_s, "v_0": v_0} for v_s in (0.15, 0.4, 1.0, 2.0) for v_0 in (0.02, 0.08))
 
     @override
     def special_case(self, p: Mapping[str, Array]) -> tuple[EffectCandidate, Mapping[str, Array]]:
-        coulomb = CoulombFriction(at=self.effect.at, turn=self.effect.turn)
+        coulomb = friction.CoulombFriction(at=self.effect.at, turn=self.effect.turn)
         return CoulombCandidate(coulomb), {"c": p["c"], "v_0": p["v_0"]}
 
 
@@ -92,9 +77,9 @@ class LoadDependentCandidate(_SignFrictionCandidate):
 
 
 CANDIDATES = {
-    CoulombFriction: CoulombCandidate,
-    ViscousFriction: ViscousCandidate,
-    StribeckFriction: StribeckCandidate,
-    QuadraticDrag: QuadraticDragCandidate,
-    LoadDependentFriction: LoadDependentCandidate,
+    friction.CoulombFriction: CoulombCandidate,
+    friction.ViscousFriction: ViscousCandidate,
+    friction.StribeckFriction: StribeckCandidate,
+    friction.QuadraticDrag: QuadraticDragCandidate,
+    friction.LoadDependentFriction: LoadDependentCandidate,
 }

@@ -8,17 +8,7 @@ import attrs
 import numpy as np
 from typing_extensions import override
 
-from quadvel_actuator.effects import DRIVE, JOINT, EffectModel
-from quadvel_actuator.effects.gains import (
-    MIN_TIME_CONSTANT_S,
-    CrossCoupling,
-    GainAsymmetry,
-    PositionCoupling,
-    PowerSag,
-    SupplySag,
-    ThermalDrift,
-    drawn_power,
-)
+from quadvel_actuator.effects import EffectModel, gains
 from quadvel_actuator.effects.limits import TorqueSaturation
 from quadvel_description.arrays import Array, Bools
 
@@ -31,22 +21,15 @@ class GainAsymmetryCandidate(EffectCandidate):
     """Gain that depends on the sign of the torque."""
 
     motion = "loads of both signs on every joint"
-
-    @classmethod
-    @override
-    def forms(cls, effect: type[EffectModel], context: FormContext) -> Sequence[EffectCandidate]:
-        return cls(GainAsymmetry("mean")), cls(GainAsymmetry("weaker"))
-
-    @override
-    def initial_guesses(self, s: Signals, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        return [{"a": a} for a in (-0.2, -0.05, 0.05, 0.2)]
+    settings_to_try = {"commanded": "mean"}, {"commanded": "weaker"}
+    guesses = tuple({"a": a} for a in (-0.2, -0.05, 0.05, 0.2))
 
 
 @attrs.frozen(eq=False)
 class ThermalDriftCandidate(EffectCandidate):
     """Gain drift with temperature or time."""
 
-    effect: ThermalDrift
+    effect: gains.ThermalDrift
     signal = "t"
     motion = "one motion repeated from cold until the drives are warm, with their temperature logged"
 
@@ -55,9 +38,9 @@ class ThermalDriftCandidate(EffectCandidate):
     def forms(cls, effect: type[EffectModel], context: FormContext) -> Sequence[EffectCandidate]:
         temperature = context.signals.temperature
         if temperature is None or float(np.ptp(temperature)) <= 0.5:
-            return (cls(ThermalDrift("time")),)
+            return (cls(gains.ThermalDrift("time")),)
         cold = float(np.quantile(temperature, 0.01))
-        return cls(ThermalDrift("time")), cls(ThermalDrift("temperature", cold))
+        return cls(gains.ThermalDrift("time")), cls(gains.ThermalDrift("temperature", cold))
 
     @override
     def initial_guesses(self, s: Signals, torque: Array, residual: Array) -> Sequence[InitialGuess]:
@@ -67,7 +50,7 @@ class ThermalDriftCandidate(EffectCandidate):
             return [{"rate": drift / warming} for drift in drifts]
         span = float(np.max(s.t))
         return [
-            {"rate": drift / min(share, 1.0) / span, "tau_t": max(share * span, MIN_TIME_CONSTANT_S)}
+            {"rate": drift / min(share, 1.0) / span, "tau_t": max(share * span, gains.MIN_TIME_CONSTANT_S)}
             for drift in drifts
             for share in (0.15, 0.5, 3.0)
         ]
@@ -77,7 +60,7 @@ class ThermalDriftCandidate(EffectCandidate):
 class SupplySagCandidate(EffectCandidate):
     """Gain or torque limit that falls with the supply voltage, or with the power where none is logged."""
 
-    effect: SupplySag | PowerSag
+    effect: gains.SupplySag | gains.PowerSag
     motion = "hard accelerations of all joints together, with the supply voltage logged"
 
     @property
@@ -91,14 +74,14 @@ class SupplySagCandidate(EffectCandidate):
         voltage = context.signals.voltage
         if voltage is not None and float(np.ptp(voltage)) > 0.01 * float(np.max(voltage)):
             full = float(np.quantile(voltage, 0.99))
-            return tuple(cls(SupplySag(what, full)) for what in ("gain", "bound"))
-        return tuple(cls(PowerSag(what)) for what in ("gain", "bound"))
+            return tuple(cls(gains.SupplySag(what, full)) for what in ("gain", "bound"))
+        return tuple(cls(gains.PowerSag(what)) for what in ("gain", "bound"))
 
     @override
     def initial_guesses(self, s: Signals, torque: Array, residual: Array) -> Sequence[InitialGuess]:
-        if isinstance(self.effect, SupplySag):
+        if isinstance(self.effect, gains.SupplySag):
             return self._guesses(self.effect.voltage_drop(s), torque)
-        sags = self._guesses(drawn_power(torque, s.dq), torque)
+        sags = self._guesses(gains.drawn_power(torque, s.dq), torque)
         return [{**sag, "T": late} for sag in sags for late in (0.002, 0.012)]
 
     def _guesses(self, strain: Array, torque: Array) -> list[InitialGuess]:
@@ -120,7 +103,7 @@ class SupplySagCandidate(EffectCandidate):
 class CrossCouplingCandidate(EffectCandidate):
     """Coupling to another joint."""
 
-    effect: CrossCoupling
+    effect: gains.CrossCoupling
     motion = "each joint moved alone while the others hold still"
 
     @property
@@ -142,7 +125,11 @@ class CrossCouplingCandidate(EffectCandidate):
     def restricted_to(self, active: Bools) -> CrossCouplingCandidate:
         """Return the form without an offset if no source of these joints is a position."""
         columns = zip(self.effect.columns, active, strict=True)
-        kind = PositionCoupling if any(acts and name == "q" for (name, _), acts in columns) else CrossCoupling
+        kind = (
+            gains.PositionCoupling
+            if any(acts and name == "q" for (name, _), acts in columns)
+            else gains.CrossCoupling
+        )
         if type(self.effect) is kind:
             return self
         return CrossCouplingCandidate(kind(self.effect.source, self.effect.columns, at=self.at))
@@ -157,16 +144,13 @@ class CrossCouplingCandidate(EffectCandidate):
         source = context.strongest_neighbours()
         if not source:
             return ()
-        settings = {"source": source}
-        joints = context.samples.joints
-        return tuple(
-            cls(CrossCoupling.from_settings({**settings, "at": at}, joints)) for at in (DRIVE, JOINT)
-        )
+        joints, every = context.samples.joints, ({"source": source, "at": at} for at in cls.places)
+        return [cls(gains.CrossCoupling.from_settings(settings, joints)) for settings in every]
 
 
 CANDIDATES = {
-    GainAsymmetry: GainAsymmetryCandidate,
-    ThermalDrift: ThermalDriftCandidate,
-    SupplySag: SupplySagCandidate,
-    CrossCoupling: CrossCouplingCandidate,
+    gains.GainAsymmetry: GainAsymmetryCandidate,
+    gains.ThermalDrift: ThermalDriftCandidate,
+    gains.SupplySag: SupplySagCandidate,
+    gains.CrossCoupling: CrossCouplingCandidate,
 }

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from typing_extensions import override
 
-from quadvel_actuator.effects.limits import SlewLimit, TorqueSaturation, TorqueSpeedLimit
+from quadvel_actuator.effects import limits
 from quadvel_description.arrays import Array
 
 from ...data.signals import Signals
@@ -45,7 +45,7 @@ class SpeedLimitCandidate(EffectCandidate):
 
     @override
     def special_case(self, p: Mapping[str, Array]) -> tuple[EffectCandidate, Mapping[str, Array]]:
-        return SaturationCandidate(TorqueSaturation()), {"limit": p["stall"]}
+        return SaturationCandidate(limits.TorqueSaturation()), {"limit": p["stall"]}
 
 
 class SlewLimitCandidate(EffectCandidate):
@@ -65,7 +65,7 @@ class SlewLimitCandidate(EffectCandidate):
 
 
 CANDIDATES = {
-    TorqueSaturation: SaturationCandidate,
-    TorqueSpeedLimit: SpeedLimitCandidate,
-    SlewLimit: SlewLimitCandidate,
+    limits.TorqueSaturation: SaturationCandidate,
+    limits.TorqueSpeedLimit: SpeedLimitCandidate,
+    limits.SlewLimit: SlewLimitCandidate,
 }

@@ -13,7 +13,7 @@ import quadvel_dds
 
 quadvel_dds.install()
 
-from quadvel_bringup import session, whereabouts  # noqa: E402
+from quadvel_bringup import discovery_hint, session  # noqa: E402
 
 HERE = int(os.environ["ROS_DOMAIN_ID"])
 ELSEWHERE = HERE + 1
@@ -42,14 +42,14 @@ def elsewhere() -> Iterator[subprocess.Popen[str]]:
 
 
 def test_a_robot_on_another_domain_is_named_with_its_domain(elsewhere: subprocess.Popen[str]) -> None:
-    text = whereabouts.discovery_hint()
+    text = discovery_hint.discovery_hint()
     assert f"on ROS domain {HERE}" in text
     assert f"sim_node (pid {elsewhere.pid}) is on {ELSEWHERE}" in text
 
 
 def test_participants_of_any_user_are_known_by_their_sockets(elsewhere: subprocess.Popen[str]) -> None:
     with open("/proc/net/udp") as table:
-        assert ELSEWHERE in whereabouts.domains_in_use(table.read())
+        assert ELSEWHERE in discovery_hint.domains_in_use(table.read())
 
 
 @pytest.mark.parametrize(
@@ -65,19 +65,19 @@ def test_participants_of_any_user_are_known_by_their_sockets(elsewhere: subproce
 )
 def test_domains_are_read_from_pairs_of_ports(ports: tuple[int, ...], domains: set[int]) -> None:
     rows = "".join(f"1: 0100007F:{port:04X} 00000000:0000 07\n" for port in ports)
-    assert whereabouts.domains_in_use(f"sl local_address\n{rows}") == domains
+    assert discovery_hint.domains_in_use(f"sl local_address\n{rows}") == domains
 
 
 def test_without_another_domain_the_own_and_the_ways_out_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(whereabouts, "running_robots", dict)
-    monkeypatch.setattr(whereabouts, "domains_in_use", lambda table: {HERE})
+    monkeypatch.setattr(discovery_hint, "running_robots", dict)
+    monkeypatch.setattr(discovery_hint, "domains_in_use", lambda table: {HERE})
     monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
-    text = whereabouts.discovery_hint()
+    text = discovery_hint.discovery_hint()
     assert f"ROS domain {HERE}" in text
     assert "ROS_DOMAIN_ID" in text
     assert "SUBNET" in text
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
-    assert "SUBNET" not in whereabouts.discovery_hint()
+    assert "SUBNET" not in discovery_hint.discovery_hint()
 
 
 def test_an_order_that_nobody_answers_says_where_the_robot_is(

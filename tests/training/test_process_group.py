@@ -13,7 +13,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
-from quadvel_training import parallel  # noqa: E402
+from quadvel_training import process_group  # noqa: E402
 
 HERE = Path(__file__).parent
 
@@ -33,10 +33,10 @@ def another(monkeypatch, tmp_path):
         [sys.executable, HERE / "half_learner.py", tmp_path / "run.pt"], env=other
     ) as process:
         try:
-            parallel.join("cpu")
+            process_group.join("cpu")
             yield process
         finally:
-            parallel.destroy_group()
+            process_group.destroy_group()
             process.kill()
 
 
@@ -45,15 +45,15 @@ def test_two_processes_with_half_of_the_robots_each_learn_as_one(another, monkey
     from half_learner import run, update
 
     together = update(slice(0, 4))
-    (weights, grid, command, samples), other = parallel.gather(run(tmp_path / "run.pt"))
+    (weights, grid, command, samples), other = process_group.gather(run(tmp_path / "run.pt"))
     assert samples == other[3] == 3 * 8 * 4
     assert np.array_equal(grid, other[1])
     assert not np.array_equal(command, other[2])
     for name, mine in weights.items():
         assert torch.equal(mine, other[0][name]), name
-    assert parallel.broadcast("first") == "first"
-    assert parallel.gather("first") == ["first", "second"]
+    assert process_group.broadcast("first") == "first"
+    assert process_group.gather("first") == ["first", "second"]
     assert another.wait(30) == 0
-    parallel.destroy_group()
+    process_group.destroy_group()
     for name, expected in update(slice(0, 8)).items():
         assert torch.allclose(together[name], expected, atol=1e-6), name

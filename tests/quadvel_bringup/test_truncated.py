@@ -16,7 +16,7 @@ COMMAND = "quadvel_msgs/msg/VelocityCommand"
 
 
 @pytest.fixture(scope="module")
-def cut_off(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def truncated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two chunks of commands, without the end of the file."""
     path = tmp_path_factory.mktemp("cut") / "walk.mcap"
     time, vector = (
@@ -37,12 +37,12 @@ def cut_off(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_what_is_kept_is_drawn_and_one_line_says_so(cut_off: Path, tmp_path: Path) -> None:
-    line = [sys.executable, "-m", "quadvel_bringup", "plot", str(cut_off), "--out", str(tmp_path / "out")]
+def test_what_is_kept_is_drawn_and_one_line_says_so(truncated: Path, tmp_path: Path) -> None:
+    line = [sys.executable, "-m", "quadvel_bringup", "plot", str(truncated), "--out", str(tmp_path / "out")]
     ended = subprocess.run(line, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "out" / "velocity.png").exists()
     warned = ended.stderr.splitlines()
     assert len(warned) == 1, warned
-    assert warned[0].startswith(f"quadvel: warning: {cut_off}: ")
+    assert warned[0].startswith(f"quadvel: warning: {truncated}: ")
     assert ".py:" not in ended.stderr

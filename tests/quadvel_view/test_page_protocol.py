@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from quadvel_view.words import (
+from quadvel_view.page_protocol import (
     MAX_MESSAGE_BYTES,
     Hold,
     ModeRequest,
