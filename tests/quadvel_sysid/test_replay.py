@@ -1,12 +1,17 @@
 """Commands replayed on the legs of a robot's description."""
 
+import subprocess
+import sys
+
 import attrs
 import numpy as np
 import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import ActuatorParameters, Effect
+from quadvel_sysid.data.dataset import Dataset
 from quadvel_sysid.export.legs import Legs, replay_deviations, stretch_starts
+from quadvel_sysid.export.replay import find_load
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.options import IdentifyOptions
@@ -121,3 +126,14 @@ def test_a_log_without_torque_is_not_identified_with_a_replay():
 def test_a_log_without_torque_is_not_replayed():
     with pytest.raises(LogError, match="still: tau, kp, kd: expected all three"):
         replay_deviations(_still(tau=None), IDEAL, Legs.load("go2", CALF), np.array([0.2]))
+
+
+def test_logs_are_identified_without_mujoco_and_legs_are_refused(monkeypatch):
+    program = (
+        "import sys; sys.modules['mujoco'] = None; import quadvel_sysid.identify, quadvel_sysid.report.report"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+    monkeypatch.setitem(sys.modules, "quadvel_sysid.export.legs", None)
+    dataset = Dataset(train=(_still(),), heldout=(), findings=(), body=None)
+    with pytest.raises(ValueError, match=r"--robot needs mujoco, .* 'quadvel-core\[sim\]'"):
+        find_load(dataset, "go2")

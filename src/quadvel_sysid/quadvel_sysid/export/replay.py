@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import attrs
 import numpy as np
@@ -17,14 +17,15 @@ from ..data.preparation import Preprocessed
 from ..logs.log import LogError
 from ..model.torque_model import Model
 from .export_parameters import actuator_parameters
-from .legs import Legs
+
+if TYPE_CHECKING:
+    from .legs import Legs
 
 _ERROR_RATIO = 0.9
 """Ratio of the replay error of a larger to a smaller model below which the larger one is chosen."""
 Key = TypeVar("Key")
 
-
-Load = Body | Legs
+Load: TypeAlias = "Body | Legs"
 """What the joints move: a body fitted to the motion, or the legs of a robot's description."""
 
 
@@ -40,6 +41,7 @@ def find_load(dataset: Dataset, robot: str | None) -> Load | None:
 
     Raises:
         LogError: The torque or the gains are missing, so that legs cannot be replayed.
+        ValueError: MuJoCo is not installed, or the description does not fit the logs.
     """
     if robot is None:
         return dataset.body
@@ -49,6 +51,12 @@ def find_load(dataset: Dataset, robot: str | None) -> Load | None:
             if getattr(log, name) is None or (name == "tau" and dataset.body is not None):
                 text = f"not in the log, expected {what} to replay the commands (--robot)"
                 raise LogError(f"{log.name}: {name}: {text}")
+    try:
+        from .legs import Legs
+    except ModuleNotFoundError:
+        raise ValueError(
+            "--robot needs mujoco, not installed here: pip install 'quadvel-core[sim]'"
+        ) from None
     return Legs.load(robot, dataset.logs[0].joints)
 
 
