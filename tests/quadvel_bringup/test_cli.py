@@ -127,5 +127,5 @@ def test_doctor_says_what_is_there_and_what_can_run() -> None:
     assert result.exit_code == 0
     subjects = [line.split()[1] for line in result.output.splitlines() if line.startswith(("ok", "note"))]
     assert subjects[:3] == ["Python", "cores", "ROS"]
-    assert {"mujoco", "onnxruntime", "cyclonedds", "clock", "GL", "torch"} <= set(subjects)
+    assert {"mujoco", "onnxruntime", "cyclonedds", "wake-up", "GL", "torch"} <= set(subjects)
     assert "can run quadvel demo, up, run, record" in result.output

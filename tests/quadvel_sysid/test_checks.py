@@ -172,6 +172,24 @@ def test_gaps_dropped_and_repeated_rows_are_counted() -> None:
     assert any(text.startswith("q: 30 rows (") for text in warnings)
 
 
+def test_repeated_rows_are_shares_of_the_rows_also_where_the_torque_repeats_more_often() -> None:
+    given = {name: fields()[name].copy() for name in ("q", "dq", "tau")}
+    given["tau"] = given["tau"][np.arange(2000) // 4 * 4]
+    for name in ("q", "dq"):
+        given[name][101:401:12] = given[name][100:400:12]
+    warnings = texts(check_log(log(**given)), "warning")
+    assert any(text.startswith("tau: 75 % of the rows repeat") for text in warnings)
+    repeated = next(text for text in warnings if text.startswith("q: 25 rows ("))
+    assert float(repeated.split("(")[1].split(" %")[0]) < 5.0
+
+
+def test_the_same_channel_twice_is_named_in_each_field() -> None:
+    q, tau = fields()["q"].copy(), fields()["tau"].copy()
+    q[:, 1], tau[:, 4] = q[:, 0], tau[:, 3]
+    warnings = texts(check_log(log(q=q, tau=tau)), "warning")
+    assert {text.partition(":")[0] for text in warnings if "the same to the bit" in text} == {"q", "tau"}
+
+
 def test_clipped_channels_and_joints_at_rest_are_named() -> None:
     dq, q = fields()["dq"], fields()["q"]
     q[:, 7] = 0.6

@@ -1,5 +1,7 @@
 """Launch a robot under ROS 2: low-level interface, estimator, controller and command mux.
 
+`Stack` names these nodes; follow.launch.py starts the planner that follows a person.
+
 ros2 launch quadvel_bringup robot.launch.py terrain:=rough
 ros2 launch quadvel_bringup robot.launch.py low_level:=aliengo
 """

@@ -9,15 +9,12 @@ import quadvel_dds
 
 from .exclusivity import ros_domain, running_robots
 
-DDS_PORTS = range(7400, 32651)
-"""UDP ports of ROS domains 0 to 101 by the RTPS standard.
-
-Higher ones overlap the ephemeral ports of the system.
-"""
 PORTS_PER_DOMAIN = 250
-"""Ports of one domain."""
+"""Ports of one domain, by the RTPS standard."""
+DDS_PORTS = range(7400, 32768)
+"""UDP ports of ROS domains 0 to 101. The system hands out the ports from 32768 on to anyone."""
 PARTICIPANT_PORT_OFFSETS = range(10, PORTS_PER_DOMAIN, 2)
-"""Offsets of a participant's discovery ports within its domain; its data port is the next one."""
+"""Offsets of a participant's discovery ports within its domain; its data port is the odd one after."""
 
 
 def discovery_hint() -> str:
@@ -69,5 +66,6 @@ def domains_in_use(table: str) -> set[int]:
 
 def _is_limited_to_this_host() -> bool:
     """Return whether the discovery range excludes other hosts."""
-    usual = "LOCALHOST" if quadvel_dds.is_installed() else "SUBNET"
-    return (os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or usual) in ("LOCALHOST", "OFF")
+    # The embedded middleware stays on this host unless asked otherwise (docs/security.md).
+    default_range = "LOCALHOST" if quadvel_dds.is_installed() else "SUBNET"
+    return (os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or default_range) in ("LOCALHOST", "OFF")

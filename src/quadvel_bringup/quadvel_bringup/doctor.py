@@ -48,7 +48,7 @@ def examine() -> Iterator[Finding]:
     yield _cores()
     yield _middleware()
     yield from map(_package, REQUIRED_PACKAGES)
-    yield _clock()
+    yield _wakeup_latency()
     yield _priority()
     yield _gl()
     yield video_encoder()
@@ -124,7 +124,7 @@ def _package(name: str) -> Finding:
         return Finding(name, False, f"missing: pip install 'quadvel-core[{REQUIRED_PACKAGES[name]}]'")
 
 
-def _clock(period: float = 0.005, ticks: int = 100) -> Finding:
+def _wakeup_latency(period: float = 0.005, ticks: int = 100) -> Finding:
     """Measure the lateness of sleeps at the rate of the controller."""
     late = np.empty(ticks)
     deadline = time.monotonic()
@@ -136,7 +136,7 @@ def _clock(period: float = 0.005, ticks: int = 100) -> Finding:
     text = f"at 200 Hz, wakes {median:.2f} ms late (median), {p99:.2f} ms (99 %)"
     good = bool(p99 < 2.0)
     return Finding(
-        "clock", good, text if good else f"{text}; the machine is busy, control loops will overrun"
+        "wake-up", good, text if good else f"{text}; the machine is busy, control loops will overrun"
     )
 
 

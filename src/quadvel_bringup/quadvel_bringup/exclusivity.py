@@ -12,47 +12,47 @@ from pathlib import Path
 from typing import Any
 
 TOPIC = "low_state"
-SERVERS = ("sim_node", "board", "driver", "quadvel_lab.plant")
-"""Words on the command lines of processes that serve TOPIC."""
+ROBOT_PROGRAMS = ("sim_node", "board", "driver", "quadvel_lab.plant")
+"""Words on the command lines of drivers and simulated robots."""
 DISCOVERY_TIME_S = 0.5
 """Time to discover other publishers."""
 LOADED_DISCOVERY_TIME_S = 4.0
-"""The same if such a process runs on this machine: a busy one answers late."""
+"""The same if one of ROBOT_PROGRAMS runs on this machine, which may be busy and answer late."""
 
 
 class RobotAlreadyRunningError(ConnectionError):
-    """Another process serves the robot's topics."""
+    """Another robot or simulator is on this ROS domain."""
 
 
 def ensure_exclusive(node: Any) -> None:
     """Check that no other node publishes low_state.
 
     Args:
-        node: A node for the discovery.
+        node: A node that does not publish low_state itself.
 
     Raises:
         RobotAlreadyRunningError: There is a publisher; the sentence names its process.
     """
-    until = time.monotonic() + (LOADED_DISCOVERY_TIME_S if robots_on_domain() else DISCOVERY_TIME_S)
-    while time.monotonic() < until:
+    deadline = time.monotonic() + (LOADED_DISCOVERY_TIME_S if robots_on_domain() else DISCOVERY_TIME_S)
+    while time.monotonic() < deadline:
         if node.count_publishers(TOPIC):
             raise RobotAlreadyRunningError(
-                f"{TOPIC}: already published on ROS domain {ros_domain()} by {_describe_servers()}. Stop it, or set "
+                f"{TOPIC}: already published on ROS domain {ros_domain()} by {_describe_robots()}. Stop it, or set "
                 "ROS_DOMAIN_ID to another number"
             )
         time.sleep(0.02)
 
 
-def _describe_servers() -> str:
-    """Name the processes of this machine and domain that serve TOPIC, or other possible causes."""
+def _describe_robots() -> str:
+    """Name the robot programs of this machine and domain, or other possible causes."""
     found = robots_on_domain()
     if not found:
         return "a robot, another host or user, or a process that was killed less than 10 s ago"
-    return ", ".join(f"{name} (pid {pid}{_starter(pid)})" for pid, name in found.items())
+    return ", ".join(f"{name} (pid {pid}{_started_by(pid)})" for pid, name in found.items())
 
 
 def robots_on_domain() -> dict[int, str]:
-    """Find the processes of this machine and ROS domain that serve TOPIC.
+    """Find the robot programs of this machine and ROS domain.
 
     Returns:
         Names by process id, as far as this user may see.
@@ -61,14 +61,14 @@ def robots_on_domain() -> dict[int, str]:
 
 
 def running_robots() -> dict[int, tuple[str, str]]:
-    """Find the processes of this machine that serve TOPIC, as far as this user may see.
+    """Find the robot programs of this machine, as far as this user may see.
 
     Returns:
         Name and ROS domain by process id.
     """
     found = {}
     for folder in Path("/proc").glob("[0-9]*"):
-        name = next((word for word in SERVERS if word in _words(folder)), None)
+        name = next((word for word in ROBOT_PROGRAMS if word in _words(folder)), None)
         environment = _environment(folder) if name and int(folder.name) != os.getpid() else None
         if name and environment is not None:
             found[int(folder.name)] = name.rpartition(".")[2], ros_domain(environment)
@@ -86,10 +86,10 @@ def _words(folder: Path) -> list[str]:
 
 
 def _environment(folder: Path) -> dict[str, str] | None:
-    """Return the environment of a process, or None if it belongs to another user."""
+    """Return the environment of a process; None if it has ended or belongs to another user."""
     try:
         pairs = (folder / "environ").read_text(errors="replace").split("\0")
-    except OSError:  # not permitted
+    except OSError:
         return None
     return dict(pair.partition("=")[::2] for pair in pairs)
 
@@ -106,7 +106,7 @@ def ros_domain(environment: Mapping[str, str] = os.environ) -> str:
     return environment.get("ROS_DOMAIN_ID") or "0"
 
 
-def _starter(pid: int) -> str:
+def _started_by(pid: int) -> str:
     """Name the `quadvel` command that started a process, if any."""
     try:
         parent = Path("/proc") / Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]
@@ -114,6 +114,6 @@ def _starter(pid: int) -> str:
         return ""
     words = [word for word in _words(parent) if word]
     for program in ("quadvel", "quadvel_bringup"):
-        if program in words[:-1]:
+        if program in words[:-1]:  # so that a word follows
             return f", started by quadvel {words[words.index(program) + 1]}, pid {parent.name}"
     return ""

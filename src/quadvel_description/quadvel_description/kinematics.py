@@ -7,7 +7,7 @@ import numpy as np
 from .robot import CALF_LENGTH, FRONT, HIP_OFFSET, LEFT, LEGS, THIGH_LENGTH, THIGH_OFFSET
 
 _LATERAL_OFFSETS = THIGH_OFFSET * np.array([LEFT[leg] for leg in LEGS], float)
-_LINK_LENGTHS = -np.array([THIGH_LENGTH, CALF_LENGTH])
+_LINK_Z = -np.array([THIGH_LENGTH, CALF_LENGTH])  # m; negative: at zero angles the links hang down
 HIPS = np.array([[HIP_OFFSET[0] * FRONT[leg], HIP_OFFSET[1] * LEFT[leg], 0.0] for leg in LEGS])
 """Hip joints in the trunk frame, (4, 3), m."""
 
@@ -19,9 +19,9 @@ def _leg_planes(q: np.ndarray) -> tuple[np.ndarray, ...]:
     the hip, (..., 4) each.
     """
     angles = np.array(q, float).reshape(*np.shape(q)[:-1], 4, 3)
-    angles[..., 2] += angles[..., 1]
+    angles[..., 2] += angles[..., 1]  # the calf relative to the trunk
     sines, cosines = np.sin(angles), np.cos(angles)
-    return sines[..., 1:] * _LINK_LENGTHS, cosines[..., 1:] * _LINK_LENGTHS, sines[..., 0], cosines[..., 0]
+    return sines[..., 1:] * _LINK_Z, cosines[..., 1:] * _LINK_Z, sines[..., 0], cosines[..., 0]
 
 
 def _feet_from_hips(forward: np.ndarray, up: np.ndarray, s: np.ndarray, c: np.ndarray) -> np.ndarray:

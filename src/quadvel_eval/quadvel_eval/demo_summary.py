@@ -109,7 +109,7 @@ def _falls(recording: Recording) -> int:
 
 
 def _loop_figures(recording: Recording) -> dict[str, float]:
-    """Figures of the controller at the end, since its start; `rate_hz` is the median while walking."""
+    """The controller's last report, on the time since its start; `rate_hz` is the median while walking."""
     loop = recording.loop
     rates = [f["rate_hz"] for f, mode in zip(loop.figures, loop.mode, strict=True) if mode == "walk"]
     last = loop.figures[-1]
@@ -118,7 +118,7 @@ def _loop_figures(recording: Recording) -> dict[str, float]:
 
 
 def _estimator_rmse(recording: Recording) -> Array:
-    """RMSE of the estimate (3,), m/s, within the segments.
+    """RMSE of the estimate (3,), m/s, from the start of the first segment to the end of the last.
 
     The truth is interpolated, because behind a network the stamps of states differ from it by a
     fraction of a millisecond.

@@ -60,8 +60,8 @@ def to_sensor(points: Array, pose: Array) -> Array:
 def check_places(scan: Scan, points: Array, sideways: Array = SIDE_OFFSETS_M) -> tuple[Bools, Bools]:
     """Check whether a scan shows that places are empty or occupied.
 
-    Neither holds if the place is hidden, if the rays are too far apart, or outside the field of
-    view.
+    Neither holds if the place is hidden or outside the field of view. A place is not called empty if
+    the rays are so far apart that a leg fits between them.
 
     Args:
         scan: The scan.

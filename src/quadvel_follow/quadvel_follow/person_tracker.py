@@ -80,7 +80,9 @@ class TrackerConfig:
         steady: Smallest share of scans in which a person was seen.
         patience: Time for which a hidden person is kept, s.
         patience_in_view: Time for which a person is kept while its place is seen empty, s.
-        forgotten: Time without a leg after which an unconfirmed hypothesis is removed, s.
+        forgotten: Time without a leg, s, after which an unconfirmed hypothesis is removed; after the
+            same time a confirmed one is not moved into places that are seen empty, and its `reach`
+            grows.
     """
 
     acceleration: float = positive(0.1)
@@ -281,7 +283,7 @@ class PersonTracker:
         assignment = self._assign(time, legs)
         self._correct(time, dt, assignment, legs)
         self._start_hypotheses(time, legs, assignment)
-        self._check_left_places(time, dt, scan, pose)
+        self._check_former_places(time, dt, scan, pose)
         self._confirm_and_prune(time, scan, pose)
         self._history.add(time, scan, pose)
         tracks = [
@@ -414,13 +416,13 @@ class PersonTracker:
     def _start_hypotheses(self, time: float, legs: _Legs, assignment: list[list[int]]) -> None:
         """Start hypotheses at unassigned legs; two legs next to each other start one."""
         assigned = {leg for pair in assignment for leg in pair}
-        left = [leg for leg in range(len(legs.position)) if leg not in assigned]
-        while left:
-            pair = [left.pop(0)]
-            if left:
-                distances = np.hypot(*(legs.position[left] - legs.position[pair[0]]).T)
+        remaining = [leg for leg in range(len(legs.position)) if leg not in assigned]
+        while remaining:
+            pair = [remaining.pop(0)]
+            if remaining:
+                distances = np.hypot(*(legs.position[remaining] - legs.position[pair[0]]).T)
                 if distances.min() < MAX_STRIDE_M:
-                    pair.append(left.pop(int(distances.argmin())))
+                    pair.append(remaining.pop(int(distances.argmin())))
             position = legs.position[pair].mean(0)
             deviations = [self._deviation(len(pair) == 2)] * 2 + [self.config.first_speed] * 2
             self._hypotheses.append(
@@ -436,7 +438,7 @@ class PersonTracker:
             )
             self._next_id += 1
 
-    def _check_left_places(self, time: float, dt: float, scan: Scan, pose: Array) -> None:
+    def _check_former_places(self, time: float, dt: float, scan: Scan, pose: Array) -> None:
         """Check whether former places of the legs are empty now; old evidence fades."""
         fading = np.exp(-dt / EVIDENCE_TIME_S)
         for hypothesis in self._hypotheses:
@@ -445,16 +447,16 @@ class PersonTracker:
             hypothesis.occupied *= fading
             while hypothesis.trail and time - hypothesis.trail[0][0] > MEMORY_S:
                 hypothesis.trail.popleft()
-        left = [
+        former = [
             (hypothesis, place)
             for hypothesis in self._hypotheses
             if hypothesis.seen == time
             for then, place in hypothesis.trail
             if time - then >= MIN_AGE_S
         ]
-        if left:
-            empty, occupied = check_places(scan, to_sensor(np.array([place for _, place in left]), pose))
-            for (hypothesis, _), is_empty, is_occupied in zip(left, empty, occupied, strict=True):
+        if former:
+            empty, occupied = check_places(scan, to_sensor(np.array([place for _, place in former]), pose))
+            for (hypothesis, _), is_empty, is_occupied in zip(former, empty, occupied, strict=True):
                 hypothesis.empty += is_empty
                 hypothesis.occupied += is_occupied
 
@@ -464,10 +466,10 @@ class PersonTracker:
             return
         kept = []
         places = np.array([h.state[:2] for h in self._hypotheses])
-        in_view = check_places(scan, to_sensor(places, pose), PERSON_OFFSETS_M)[0]
-        for hypothesis, visible in zip(self._hypotheses, in_view, strict=True):
+        seen_empty, _ = check_places(scan, to_sensor(places, pose), PERSON_OFFSETS_M)
+        for hypothesis, is_empty in zip(self._hypotheses, seen_empty, strict=True):
             hypothesis.confirmed = hypothesis.confirmed or self._has_walked(hypothesis, time)
-            patience = self.config.patience_in_view if visible else self.config.patience
+            patience = self.config.patience_in_view if is_empty else self.config.patience
             if time - hypothesis.seen <= (patience if hypothesis.confirmed else self.config.forgotten):
                 kept.append(hypothesis)
         walkers = [h for h in kept if h.confirmed or h.moved > self.config.moved]

@@ -1,4 +1,7 @@
-"""ROS node `trajectory_planner`: velocities cmd_vel from a file, in open loop or closed on odom."""
+"""ROS node `trajectory_planner`: publishes cmd_vel along a trajectory from a file.
+
+In open loop, or in closed loop on odom. `trajectory` reads the file and sets the velocities in time.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,9 @@ class TrajectoryParameters:
 
     file: str = field("zju", "CSV or GPX file, or a shipped one: zju, eight")
     closed_loop: bool = field(False, "whether deviations of odom from the trajectory are corrected")
-    speed: float = positive(0.5, "speed along a file of places, m/s")
+    speed: float = positive(
+        0.5, "speed along the points of a CSV (x, y) or GPX file, m/s; times in a GPX file are ignored"
+    )
 
     def load(self) -> Trajectory:
         """Load the trajectory.

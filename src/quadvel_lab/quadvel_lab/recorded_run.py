@@ -79,13 +79,13 @@ class RecordedRun(ABC):
 
     @abstractmethod
     def is_over(self, ended: Mapping[str, int]) -> bool:
-        """Return whether the run is complete.
+        """Return whether the run is complete and succeeded.
 
         Args:
             ended: Exit codes of ended processes by name.
 
         Returns:
-            True if it ends in good order.
+            True if it did; `failure` says what makes it fail.
         """
 
     def failure(self) -> str:

@@ -53,13 +53,13 @@ class ScriptedWalk(RecordedRun):
         node.create_subscription(String, "planner/step", self._on_step, 10)
 
     def is_over(self, ended: Mapping[str, int]) -> bool:
-        """Return whether the planner ended in good order.
+        """Return whether the walk is complete: the planner, and no other process, ended with 0.
 
         Args:
             ended: Exit codes of ended processes by name.
 
         Returns:
-            True at the end.
+            True if the run succeeded; `failure` says what makes it fail.
         """
         return dict(ended) == {"planner": 0}
 

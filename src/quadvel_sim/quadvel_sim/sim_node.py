@@ -1,4 +1,7 @@
-"""ROS node `sim_node`: the simulated robot behind the topics of the real one."""
+"""ROS node `sim_node`: offers the simulated robot through the topics of the real one.
+
+Its base `SimulationNode` publishes the ground truth and has the services.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ from quadvel_sim.simulator import Simulator
 
 
 class SimNode(SimulationNode[SimParameters]):
-    """ROS node of a simulated robot behind low_state and low_cmd."""
+    """ROS node that answers low_cmd with low_state of a simulated robot."""
 
     def __init__(self, make_simulator: Callable[[SimulatorConfig], Simulator] = Simulator) -> None:
         """Start the simulation.

@@ -1,11 +1,11 @@
 """Web server of the page, its messages in both directions, and viser's scene on the same port.
 
 The scene is one-way: viser's messages are forwarded to the browser, and the browser's messages to
-viser are dropped.
+viser are dropped. `AccessControl` checks token, Host and Origin of each request.
 
-If the page has the host name 127.0.0.1, its scene has localhost, and vice versa. To the browser
-these are two sites with a process each, so that rendering never delays the pad and the STOP. With a
-token both have the same name, because the browser sends the token's cookie only to the name that
+A page opened as 127.0.0.1 embeds the scene from localhost, and vice versa. To the browser these are
+two sites, which it renders in two processes: drawing never delays the pad and the STOP. With a token
+both have the same name, because the browser sends the token's cookie only to the name that
 set it.
 """
 

@@ -15,13 +15,14 @@ class Case:
         component: Faulty component, see `injection.COMPONENTS`.
         kind: Kind of fault, see `injection.KINDS`.
         mode: Mode of the controller at the fault, one of MODES.
-        expected_findings: Names in the table of faults, of which one must be found; empty: none.
-        finding_deadline: Time for the finding, s.
-        expected_end: "damping"; "stance"; "stopped" (one of these two, because without an IMU some
+        expected_findings: Names in docs/faults.md. At least one of these findings must be reported;
+            others may be, too. Empty: none is required.
+        finding_deadline: Longest time from the fault to the finding, s.
+        expected_end: State that must be reached: "damping"; "stance"; "stopped" (one of these two, because without an IMU some
             robots cannot reach a stand); "stands" (the policy stands, as without a command);
             "goes on" (the fault has no effect); "any" (continue or stop, but no fall without a
             finding).
-        safe_deadline: Time for the expected end, s.
+        safe_deadline: Longest time from the fault to the expected end, s.
     """
 
     component: str

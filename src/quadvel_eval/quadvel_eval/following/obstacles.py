@@ -32,20 +32,20 @@ class Clearances:
         self._tree = cKDTree(self._points) if len(self._points) else None
 
     def to_obstacles(self, pose: Array) -> float:
-        """Return the distance from the outline to the nearest obstacle.
+        """Return the distance from the robot's outline to the nearest obstacle; negative on contact.
 
         Args:
             pose: x, y (m) and yaw (rad) of the robot (3,).
 
         Returns:
-            Distance, m; inf if none is within SEARCH_RADIUS_M.
+            Distance, m; inf if none is within SEARCH_RADIUS_M of the robot's centre.
         """
         if self._tree is None or not (near := self._tree.query_ball_point(pose[:2], SEARCH_RADIUS_M)):
             return float("inf")
         return float(outline_distance(self._points[near], pose, self._half).min())
 
     def to_people(self, pose: Array, people: Array) -> float:
-        """Return the distance from the outline to the nearest person.
+        """Return the distance from the robot's outline to the nearest person; negative on contact.
 
         Args:
             pose: x, y (m) and yaw (rad) of the robot (3,).
@@ -60,7 +60,7 @@ class Clearances:
 
 
 def outline_points(world: World) -> Array:
-    """Sample the outlines of walls, boxes, trees and table legs.
+    """Sample the outlines of walls, boxes and trees; a table leg is one point.
 
     Args:
         world: The world.
@@ -76,7 +76,7 @@ def outline_points(world: World) -> Array:
         for a, b in pairwise(wall.points)
     ]
     found += [_rectangle(box.position, box.size[:2], np.radians(box.yaw)) for box in world.boxes]
-    found += [_circle(place, trees.radius) for trees in world.trees for place in trees.positions]
+    found += [_circle(position, group.radius) for group in world.trees for position in group.positions]
     found += [table.legs for table in world.tables]
     return np.concatenate(found) if found else np.zeros((0, 2))
 

@@ -1,6 +1,7 @@
 """Interface of a section of the paper's evaluation: jobs, records, a figure and table rows.
 
-Each section has its own module. Module `study` runs the sections and writes their files.
+Each section has its own module. Module `study` runs the sections; `files.write_section` writes CSV,
+figure and JSON.
 """
 
 from __future__ import annotations
@@ -60,10 +61,10 @@ class Study:
 
 @attrs.frozen
 class Job:
-    """A call for another process, with labels for its answer.
+    """A call for another process, with labels for its result.
 
     Attributes:
-        labels: Columns of the records made from the answer.
+        labels: Columns that every record of the result gets.
         call: Function and arguments.
     """
 
@@ -90,12 +91,12 @@ def walk_jobs(study: Study, walk: Callable[..., Any], *arguments: Any) -> list[J
 
 
 JobResults: TypeAlias = Sequence[tuple[Record, Any]]
-"""Labels and answer of each job, in the order of the jobs."""
+"""Labels and result of each job, in the order of the jobs."""
 
 
 @attrs.frozen
 class Row:
-    """One line of the page: the paper's value (its CRL-EAM) next to those of our policies.
+    """One line of README.md (see `files`): the paper's value for its policy CRL-EAM next to those of our policies.
 
     Attributes:
         what: Name of the quantity.
@@ -103,7 +104,7 @@ class Row:
         paper: Value of the paper; None if unknown.
         ours: Values by policy; None if undefined.
         digits: Decimals in the table.
-        key: Whether the page repeats the row in its first table.
+        key: Whether README.md repeats the row in its first table.
     """
 
     what: str
@@ -217,7 +218,7 @@ def column(records: Iterable[Record], name: str) -> np.ndarray:
 def by_policy(
     records: Sequence[Record], measure: Callable[[Sequence[Record]], float | None]
 ) -> dict[str, float | None]:
-    """Compute a figure for each policy.
+    """Compute a number for each policy.
 
     Args:
         records: The records.

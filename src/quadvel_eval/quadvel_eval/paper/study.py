@@ -1,4 +1,4 @@
-"""Runs sections of the paper's evaluation in parallel and writes each when its last walk ends.
+"""Runs sections of the paper's evaluation in parallel; `files` writes each when its last walk ends.
 
 A section is skipped if its files were made with the same networks, seeds and settings.
 Therefore an interrupted study continues with the missing sections.

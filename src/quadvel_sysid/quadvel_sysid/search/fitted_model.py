@@ -169,7 +169,7 @@ class ModelEvaluator:
         )
 
     def restrict_joints(self, fitted: FittedModel, index: int) -> FittedModel:
-        """Restrict an effect to joints with a significant effect, if that lowers the criterion.
+        """Restrict an effect to the joints where it is significant, if that lowers the criterion.
 
         Args:
             fitted: A fitted model.
@@ -181,7 +181,7 @@ class ModelEvaluator:
         effect = fitted.model.effects[index]
         if effect.candidate.all_joints_together:
             return fitted
-        without = FittedModel(fitted.model.without_effect(index), self)
+        without = FittedModel(fitted.model.without_effect(index), self)  # other values as fitted
         comparison = fitted.compare_with(without)
         cost = PENALTY_PER_PARAMETER * effect.candidate.complexity(self.options.memory_cost)
         needed = (

@@ -70,12 +70,12 @@ def motionless(log: Log) -> Iterator[Finding]:
     Yields:
         A refusal if no joint moves, a warning if some joints do not.
     """
-    resting = log.joints_where(np.ptp(log.q, axis=0) < MOVING_SPAN_RAD)
-    if len(resting) == len(log.joints):
-        yield Finding("refusal", "q", resting, "q: no joint ever moves, so nothing can be identified")
-    elif resting:
-        text = f"q: never moves: {format_names(resting)}; only their torque at rest is observed"
-        yield Finding("warning", "q", resting, text)
+    still = log.joints_where(np.ptp(log.q, axis=0) < MOVING_SPAN_RAD)
+    if len(still) == len(log.joints):
+        yield Finding("refusal", "q", still, "q: no joint ever moves, so nothing can be identified")
+    elif still:
+        text = f"q: never moves: {format_names(still)}; only their torque at rest is observed"
+        yield Finding("warning", "q", still, text)
 
 
 def torque_presence(log: Log) -> Iterator[Finding | Log]:
@@ -89,14 +89,15 @@ def torque_presence(log: Log) -> Iterator[Finding | Log]:
     """
     tau = log.tau
     if tau is not None:
-        dead = log.joints_where(np.ptp(tau, axis=0) == 0.0)
-        if len(dead) == len(log.joints):
-            text = f"tau: is {tau[0, 0]:g} throughout, which is no measurement; treated as not logged"
-            yield Finding("warning", "tau", dead, text)
+        constant = log.joints_where(np.ptp(tau, axis=0) == 0.0)
+        if len(constant) == len(log.joints):
+            values = ", ".join(f"{value:g}" for value in np.unique(tau[0]))
+            text = f"tau: is {values} throughout, which is no measurement; treated as not logged"
+            yield Finding("warning", "tau", constant, text)
             tau, log = None, attrs.evolve(log, tau=None)
             yield log
-        elif dead:
-            yield Finding("warning", "tau", dead, f"tau: never changes: {format_names(dead)}")
+        elif constant:
+            yield Finding("warning", "tau", constant, f"tau: never changes: {format_names(constant)}")
     if tau is None:
         text = "tau: not in the log; effects are judged by the motion that follows from the commands"
         yield Finding("note", "tau", (), text)
@@ -115,7 +116,7 @@ def torque_or_gains(log: Log) -> Iterator[Finding]:
     if log.tau is None and lacking:
         text = (
             f"tau, {', '.join(lacking)}: not in the log; expected the torque, or the commanded gains in N m/rad "
-            "and N m s/rad (--gains KP KD), as nothing else gives the scale; a servo's own numbers do not"
+            "and N m s/rad (--gains KP KD), as nothing else gives the scale; gains in a servo's own units do not"
         )
         yield Finding("refusal", "tau", (), text)
 
@@ -163,7 +164,7 @@ def repeated_rows(log: Log) -> Iterator[Finding | Log]:
     runs = np.diff(np.flatnonzero(np.concatenate([[True], ~same, [True]])))
     low, usual, high = np.percentile(runs, [25, 50, 75])
     if usual >= 2 and high - low <= 0.25 * usual:
-        moving = ~same | same  # all rows: an even pattern comes from the logger
+        moving = np.ones_like(same)  # regular repeats come from the logger, so all rows count
     else:
         moving = np.abs(log.dq[1:]).max(axis=1) > MOVING_SPEED_RAD_S
     repeated, total = int((same & moving).sum()), max(1, int(moving.sum()))
@@ -179,10 +180,11 @@ def repeated_rows(log: Log) -> Iterator[Finding | Log]:
         return
     if log.tau is not None:
         late = (np.diff(log.tau, axis=0) == 0.0).all(axis=1)
-        if late[moving].mean() > REPEATED_ROWS_SHARE:
-            share = 100.0 * late[moving].mean()
+        tau_share = int((late & moving).sum()) / total
+        if tau_share > REPEATED_ROWS_SHARE:
             text = (
-                f"tau: {share:.0f} % of the rows repeat the torque before; those in which it changed are used"
+                f"tau: {100 * tau_share:.0f} % of the rows repeat the torque before; those in which it changed "
+                "are used"
             )
             yield Finding("warning", "tau", (), text)
             yield attrs.evolve(log, valid=log.valid & ~np.concatenate([[False], late])[:, None])
@@ -210,7 +212,7 @@ def duplicated_channels(log: Log) -> Iterator[Finding]:
             if other != joint and np.ptp(column) > 0.0:
                 text = f"{field}: {joint} and {other} are the same to the bit: one measured joint under two names?"
                 yield Finding("warning", field, (other, joint), text)
-                return
+                break
 
 
 def joint_ranges(log: Log) -> Iterator[Finding]:

@@ -17,14 +17,16 @@ from .response import EXPLAINED_ERROR_SHARE, TIME_ROUNDING_S, least_squares_resi
 LAGS_S = (0.0, 0.005, 0.01, 0.02, 0.04)
 """s; lags from a command to its torque that are tried."""
 BULK_QUANTILE = 0.8
-"""Quantile of the deviations that gives their scale: a tenth of the rows may be spikes, another
-tenth at rest.
+"""Quantile of the deviations that gives their scale: a tenth of the rows may be spikes, and a tenth
+of rows at rest, which deviate less, hardly changes it.
 """
+BULK_SIGMAS = 1.28
+"""The same quantile of the magnitude of a standard normal variable."""
 SPIKE_SIGMAS = 8.0
 """Standard deviations from which a row is a spike: normal noise exceeds them once in 10^14 rows."""
 MIN_SPIKE_SIGMAS = 2.0
-"""Standard deviations of the torque itself that a spike reaches at least; friction and a coarse
-speed change less in one row.
+"""Standard deviations of the torque itself that a spike reaches at least: friction, or a coarsely
+measured speed, can change the torque by less than this in one row.
 """
 MIN_SPIKES = 3
 """Fewest spikes of a joint; one or two may be a foot that strikes between two samples of a slow log."""
@@ -37,8 +39,8 @@ MIN_SIGN_SHARE = 0.05
 NEAR_ZERO_SHARE = 0.1
 """A quantity reaches 0 if its 5th percentile is below this share of its 95th percentile."""
 MAGNITUDE_ERROR_RATIO = 0.9
-"""The magnitude of a sum must leave less than this share of the squared error that the sum itself
-leaves.
+"""A torque has no sign if the magnitude of a PD law leaves less than this share of the squared error
+of the PD law.
 """
 
 
@@ -54,86 +56,93 @@ def spikes(log: Log) -> Iterator[Finding | Log]:
     if log.tau is None:
         return
     tau = np.asarray(log.tau, dtype=float)
-    level, hit = tau.copy(), np.zeros(tau.shape, bool)
+    cleaned, is_spike = tau.copy(), np.zeros(tau.shape, bool)
     for j in range(len(log.joints)):
-        level[:, j], hit[:, j] = _without_spikes(log, j)
-    if hit.any():
-        joints, size = log.joints_where(np.asarray(hit.any(axis=0))), float(np.abs(tau - level).max())
+        cleaned[:, j], is_spike[:, j] = _without_spikes(log, j)
+    if is_spike.any():
+        joints, size = log.joints_where(np.asarray(is_spike.any(axis=0))), float(np.abs(tau - cleaned).max())
         text = (
-            f"tau: spikes in up to {100 * hit.mean(axis=0).max():.2g} % of the rows of {format_names(joints)}: single rows up to "
-            f"{size:.3g} N m off the rows around and off what command and motion explain; left out"
+            f"tau: spikes in up to {100 * is_spike.mean(axis=0).max():.2g} % of the rows of "
+            f"{format_names(joints)}: single rows up to {size:.3g} N m off the rows around and off what "
+            "command and motion explain; left out"
         )
         yield Finding("warning", "tau", joints, text)
-        yield attrs.evolve(log, tau=level, valid=log.valid & ~hit)
+        yield attrs.evolve(log, tau=cleaned, valid=log.valid & ~is_spike)
 
 
 def _without_spikes(log: Log, j: int) -> tuple[Floats, Bools]:
     """Replace the spikes of a joint by the median around them; return torque and mask, (N,)."""
     assert log.tau is not None
     tau = np.asarray(log.tau[:, j], dtype=float)
-    level, hit = tau.copy(), np.zeros(len(tau), bool)
-    sides = np.sign(np.pad(log.dq[:, j], 1, mode="edge"))
-    turns = sides[:-2] != sides[2:]  # friction changes its sign there, perhaps in a single row
+    cleaned, is_spike = tau.copy(), np.zeros(len(tau), bool)
+    direction = np.sign(np.pad(log.dq[:, j], 1, mode="edge"))
+    reverses = direction[:-2] != direction[2:]  # friction changes its sign there, perhaps in a single row
     for _ in range(FIT_ROUNDS):
-        around, alone = _local_median(level)
-        alone = np.where(turns, 0.0, alone)
-        found = np.abs(alone) > SPIKE_SIGMAS * _robust_std(level - around)
+        around, excess = _local_median(cleaned)
+        excess = np.where(reverses, 0.0, excess)
+        found = np.abs(excess) > SPIKE_SIGMAS * _robust_std(cleaned - around)
         if found.any():
-            found &= np.abs(alone) > MIN_SPIKE_SIGMAS * _robust_std(tau - np.median(tau))
+            found &= np.abs(excess) > MIN_SPIKE_SIGMAS * _robust_std(tau - np.median(tau))
         if found.any():
-            laws = [_pd_regressors(log, np.arange(len(tau)), j, lag) for lag in LAGS_S]
-            left = min((level - _fitted_torque(law, level, ~found) for law in laws), key=_robust_std)
-            found &= np.abs(left) > SPIKE_SIGMAS * _robust_std(left)
+            regressors = [_pd_regressors(log, np.arange(len(tau)), j, lag) for lag in LAGS_S]
+            residual = min(
+                (cleaned - _fitted_torque(x, cleaned, ~found) for x in regressors), key=_robust_std
+            )
+            found &= np.abs(residual) > SPIKE_SIGMAS * _robust_std(residual)
         if not found.any():
             break
-        level, hit = np.where(found, around, level), hit | found
-    return (level, hit) if hit.sum() >= MIN_SPIKES else (tau, np.zeros(len(tau), bool))
+        cleaned, is_spike = np.where(found, around, cleaned), is_spike | found
+    return (cleaned, is_spike) if is_spike.sum() >= MIN_SPIKES else (tau, np.zeros(len(tau), bool))
 
 
 def _pd_regressors(log: Log, row: Indices, j: int, lag: float) -> Floats:
     """Regressors of a PD law, (R, 5 or more): error, angle, speed, friction, 1, feed-forward terms."""
-    sent = log.command_rows(log.t[row] - lag + TIME_ROUNDING_S)
+    # Commands have rows and a clock of their own: (M, J) at `t_cmd`.
+    command = log.command_rows(log.t[row] - lag + TIME_ROUNDING_S)
     q, dq = (np.asarray(x[row, j], dtype=float) for x in (log.q, log.dq))
-    fed = [x[sent, j] for x in (log.dq_des, log.tau_ff) if x is not None]
-    return np.stack([log.q_des[sent, j] - q, q - q.mean(), *motion_regressors(dq).T, *fed], axis=1).astype(
-        float
-    )
+    feed_forward = [x[command, j] for x in (log.dq_des, log.tau_ff) if x is not None]
+    return np.stack(
+        [log.q_des[command, j] - q, q - q.mean(), *motion_regressors(dq).T, *feed_forward], axis=1
+    ).astype(float)
 
 
 def _local_median(x: Floats) -> tuple[Floats, Floats]:
-    """Median (N,) of the four rows around each row, and how far the row exceeds all but one.
+    """Median (N,) of the four rows around each row, and the excess of the row over these.
+
+    The excess is how far the row is above the second largest of the four, or below (negative) the
+    second smallest.
 
     The excess is 0 if it is less than half the range of these four: the peak of a fast motion is
     no spike.
     """
     padded = np.pad(x, 2, mode="edge")
-    sides = np.sort([padded[k : k + len(x)] for k in (0, 1, 3, 4)], axis=0)
-    alone = np.maximum(x - sides[2], 0.0) - np.maximum(sides[1] - x, 0.0)
-    alone[np.abs(alone) < 0.5 * (sides[3] - sides[0])] = 0.0
-    alone[[0, 1, -2, -1]] = 0.0
-    return np.asarray(np.median(sides, axis=0)), alone
+    neighbours = np.sort([padded[k : k + len(x)] for k in (0, 1, 3, 4)], axis=0)
+    excess = np.maximum(x - neighbours[2], 0.0) - np.maximum(neighbours[1] - x, 0.0)
+    excess[np.abs(excess) < 0.5 * (neighbours[3] - neighbours[0])] = 0.0
+    excess[[0, 1, -2, -1]] = 0.0
+    return np.asarray(np.median(neighbours, axis=0)), excess
 
 
 def _robust_std(deviation: Floats) -> float:
-    """Standard deviation of the normal distribution that has the bulk of the deviations."""
-    return float(np.quantile(np.abs(deviation), BULK_QUANTILE)) / 1.28 + 1e-9
+    """Standard deviation of the normal distribution with the same `BULK_QUANTILE`; never 0."""
+    return float(np.quantile(np.abs(deviation), BULK_QUANTILE)) / BULK_SIGMAS + 1e-9
 
 
-def _fitted_torque(law: Floats, tau: Floats, use: Bools) -> Floats:
-    """Torque (N,) of the law fitted to the rows in `use`, with outliers removed round by round."""
+def _fitted_torque(regressors: Floats, tau: Floats, use: Bools) -> Floats:
+    """Torque (N,) of a PD law fitted to the rows in `use`, with outliers removed round by round."""
     rows = np.flatnonzero(use)
     rows = rows[:: max(1, len(rows) // MAX_FIT_ROWS)]
-    x, y = law[rows], tau[rows]
+    x, y = regressors[rows], tau[rows]
     keep = np.ones(len(rows), bool)
     for _ in range(FIT_ROUNDS):
         weights = np.linalg.lstsq(x[keep], y[keep], rcond=1e-9)[0]
-        left = np.abs(y - x @ weights)
-        keep = left <= SPIKE_SIGMAS * _robust_std(left)
-    return np.asarray(law @ weights)
+        residual = np.abs(y - x @ weights)
+        keep = residual <= SPIKE_SIGMAS * _robust_std(residual)
+    return np.asarray(regressors @ weights)
 
 
 def unsigned_torque(log: Log) -> Iterator[Finding]:
-    """Torque without its sign: never negative, and explained by the magnitude of a PD law.
+    """Torque without its sign: of one sign only, and explained by the magnitude of a PD law.
 
     Args:
         log: The log to check.
@@ -147,6 +156,7 @@ def unsigned_torque(log: Log) -> Iterator[Finding]:
     row = row[:: max(1, len(row) // MAX_FIT_ROWS)]
     tau = np.asarray(log.tau[row], dtype=float)
     error = np.stack([_pd_regressors(log, row, j, 0.0)[:, 0] for j in range(len(log.joints))], axis=1)
+    # An offset above a turn is one of the counting of turns, not of the control.
     error -= np.median(error, axis=0) * (np.abs(np.median(error, axis=0)) > TURN_RAD)
     hit = lacks_sign(tau, error)
     for j in np.flatnonzero(hit):
@@ -154,8 +164,8 @@ def unsigned_torque(log: Log) -> Iterator[Finding]:
     if hit.any():
         joints = log.joints_where(hit)
         text = (
-            f"tau: has no sign on {format_names(joints)}: it never changes its sign, and the size of what a PD law asks for "
-            "explains it better than that with an offset; expected a torque with its sign (leave it out if only its magnitude is "
+            f"tau: has no sign on {format_names(joints)}: it never changes its sign, and the absolute value of a PD law "
+            "fits it better than a PD law with an offset; expected a torque with its sign (leave it out if only its magnitude is "
             "measured)"
         )
         yield Finding("refusal", "tau", joints, text)
