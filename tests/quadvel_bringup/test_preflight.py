@@ -28,7 +28,7 @@ def test_the_shipped_stack_is_in_order() -> None:
     for low_level in LOW_LEVELS:
         check_stack(Stack(low_level=low_level))
     assert set(NODE_CHECKS) == {
-        name for low_level in LOW_LEVELS for name in Stack(low_level=low_level).overrides()
+        name for low_level in LOW_LEVELS for name in Stack(low_level=low_level).node_parameters()
     }
 
 

@@ -72,7 +72,7 @@ def test_the_table_of_nodes_agrees_with_the_entry_points_for_ros(name: str) -> N
 
 
 def test_every_node_of_the_stack_is_in_the_table() -> None:
-    assert set(Stack().overrides()) <= set(nodes.NODES)
+    assert set(Stack().node_parameters()) <= set(nodes.NODES)
 
 
 def test_an_unknown_node_is_refused_with_the_known_ones() -> None:
@@ -116,7 +116,7 @@ def test_what_was_chosen_stands_above_the_parameter_file(tmp_path: Path) -> None
 
 def test_a_world_is_a_name_or_a_file_of_any_folder() -> None:
     for world, handed_on in (("campus", "campus"), ("mine.yaml", str(Path("mine.yaml").resolve()))):
-        assert Stack(world=world).overrides()["sim_node"] == {"world": handed_on}
+        assert Stack(world=world).node_parameters()["sim_node"] == {"world": handed_on}
 
 
 @pytest.mark.parametrize(
@@ -124,23 +124,23 @@ def test_a_world_is_a_name_or_a_file_of_any_folder() -> None:
 )
 def test_what_only_a_simulated_robot_has_is_refused_for_another(chosen: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"only a simulated robot has this, not external"):
-        Stack(low_level="external", **chosen).overrides()
+        Stack(low_level="external", **chosen).node_parameters()
 
 
 def test_in_simulated_time_the_simulator_waits_and_the_others_follow_its_clock() -> None:
-    overrides = Stack(use_sim_time=True).overrides()
+    overrides = Stack(use_sim_time=True).node_parameters()
     assert overrides.pop("sim_node") == {"mode": "lockstep"}
     assert all(values["use_sim_time"] is True for values in overrides.values())
 
 
 def test_beside_a_robot_that_others_serve_nothing_moves_without_an_operator() -> None:
-    overrides = Stack(low_level="external").overrides()
+    overrides = Stack(low_level="external").node_parameters()
     assert "sim_node" not in overrides
     assert overrides["controller"] == {"auto_stand": False, "require_operator": True}
 
 
 def test_behind_the_boards_interface_stand_the_simulated_board_and_the_real_driver() -> None:
-    overrides = Stack(low_level="board", terrain="rough", network={"network_loss": 0.1}).overrides()
+    overrides = Stack(low_level="board", terrain="rough", network={"network_loss": 0.1}).node_parameters()
     assert list(overrides) == ["board", "driver", "estimator", "controller", "command_mux"]
     port = 8007 + int(os.environ["ROS_DOMAIN_ID"])
     assert overrides["board"] == {"port": port, "terrain": "rough", "network_loss": 0.1}
@@ -149,7 +149,7 @@ def test_behind_the_boards_interface_stand_the_simulated_board_and_the_real_driv
 
 
 def test_the_robot_itself_stands_up_and_walks_only_on_an_operators_call() -> None:
-    overrides = Stack(low_level="aliengo").overrides()
+    overrides = Stack(low_level="aliengo").node_parameters()
     assert list(overrides) == ["driver", "estimator", "controller", "command_mux"]
     assert overrides["driver"] == overrides["estimator"] == {"realtime_priority": 50}
     assert overrides["controller"] == {

@@ -69,7 +69,7 @@ def start(context: LaunchContext) -> list[Action]:
             parameters=[str(stack.parameters), *([overrides] if overrides else [])],
             on_exit=EmitEvent(event=Shutdown(reason=f"{name} ended")),
         )
-        for name, overrides in stack.overrides().items()
+        for name, overrides in stack.node_parameters().items()
     ]
     shared = {"use_sim_time": stack.use_sim_time}
     if chosen["rviz"] == "true":

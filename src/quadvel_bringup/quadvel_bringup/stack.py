@@ -108,8 +108,8 @@ class Stack:
         """Whether one of the nodes serves the robot's topics."""
         return bool(LOW_LEVELS[self.low_level].nodes)
 
-    def overrides(self) -> dict[str, Parameters]:
-        """Return the parameters that override those of the file.
+    def node_parameters(self) -> dict[str, Parameters]:
+        """Return the nodes to start, with the parameters that override those of the file.
 
         Returns:
             Parameters by name of the nodes to start.
@@ -147,7 +147,7 @@ class Stack:
         Returns:
             Arguments by name of the node.
         """
-        nodes = self.overrides() | ({VIEW: {}} if view else {})
+        nodes = self.node_parameters() | ({VIEW: {}} if view else {})
         return {name: ros_arguments(name, values, self.parameters) for name, values in nodes.items()}
 
     def commands(self, view: bool = False) -> dict[str, list[str]]:

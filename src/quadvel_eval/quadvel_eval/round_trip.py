@@ -8,7 +8,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 
@@ -60,9 +60,9 @@ def measure_round_trips(count: int = 1000) -> dict[str, float]:
 
     echo = subprocess.Popen([sys.executable, "-m", "quadvel_eval.round_trip"])
     try:
-        until = time.monotonic() + DISCOVERY_TIMEOUT_S
+        deadline = time.monotonic() + DISCOVERY_TIMEOUT_S
         while np.isnan(trip(0)):
-            if time.monotonic() > until:
+            if time.monotonic() > deadline:
                 raise RuntimeError(f"no answer from the other process within {DISCOVERY_TIMEOUT_S:g} s")
         times = np.array([_paced_trip(trip, tick) for tick in range(1, count + 1)])
     finally:
@@ -74,10 +74,11 @@ def measure_round_trips(count: int = 1000) -> dict[str, float]:
     return {"p50_us": float(p50), "p99_us": float(p99), "lost": int(np.isnan(times).sum())}
 
 
-def _paced_trip(trip: Any, tick: int) -> float:
+def _paced_trip(trip: Callable[[int], float], tick: int) -> float:
     """Time one round trip, then sleep until the next control period."""
-    elapsed: float = trip(tick)
-    time.sleep(max(CONTROL_PERIOD_S - elapsed, 0.0) if elapsed == elapsed else 0.0)
+    elapsed = trip(tick)
+    if not np.isnan(elapsed):  # a lost message has taken longer than the period
+        time.sleep(max(CONTROL_PERIOD_S - elapsed, 0.0))
     return elapsed
 
 

@@ -69,18 +69,18 @@ class TrackerConfig:
         one_leg: Standard deviation of a position from one leg, m.
         first_speed: Standard deviation of the initial velocity, m/s.
         reach: Largest distance from the predicted position to a leg, m.
-        possible: Smallest probability of a possible leg.
-        walked: Smallest distance from the first position of a person, m.
-        moved: Smallest share of checks that found its places empty before or after it was there.
-        surprise: Largest mean distance from predicted to measured position of a person, m.
-        pairs: Smallest share of scans that show both legs of a person.
-        belief: Smallest mean probability of the legs of a person.
-        watched: Smallest time since a person was first seen, s.
-        sightings: Smallest number of scans in which a person was seen.
-        steady: Smallest share of scans in which a person was seen.
-        patience: Time for which a hidden person is kept, s.
-        patience_in_view: Time for which a person is kept while its place is seen empty, s.
-        forgotten: Time without a leg, s, after which an unconfirmed hypothesis is removed; after the
+        min_leg_probability: Smallest probability of a possible leg.
+        min_distance: Smallest distance of a person from its first position, m.
+        min_moved_share: Smallest share of checks that found its places empty before or after it was there.
+        max_mean_error: Largest mean distance from predicted to measured position of a person, m.
+        min_pair_share: Smallest share of scans that show both legs of a person.
+        min_mean_probability: Smallest mean probability of the legs of a person.
+        min_age: Smallest time since a person was first seen, s.
+        min_sightings: Smallest number of scans in which a person was seen.
+        min_seen_share: Smallest share of scans in which a person was seen.
+        hidden_timeout: Time for which a hidden person is kept, s.
+        empty_place_timeout: Time for which a person is kept while its place is seen empty, s.
+        candidate_timeout: Time without a leg, s, after which an unconfirmed hypothesis is removed; after the
             same time a confirmed one is not moved into places that are seen empty, and its `reach`
             grows.
     """
@@ -90,18 +90,18 @@ class TrackerConfig:
     one_leg: float = positive(0.3)
     first_speed: float = positive(0.8)
     reach: float = positive(0.9)
-    possible: float = positive(0.15)
-    walked: float = positive(0.5)
-    moved: float = positive(0.55)
-    surprise: float = positive(0.22)
-    pairs: float = positive(0.3)
-    belief: float = positive(0.6)
-    watched: float = positive(1.0)
-    sightings: int = positive(8, whole=True)
-    steady: float = positive(0.7)
-    patience: float = positive(3.0)
-    patience_in_view: float = positive(1.5)
-    forgotten: float = positive(0.5)
+    min_leg_probability: float = positive(0.15)
+    min_distance: float = positive(0.5)
+    min_moved_share: float = positive(0.55)
+    max_mean_error: float = positive(0.22)
+    min_pair_share: float = positive(0.3)
+    min_mean_probability: float = positive(0.6)
+    min_age: float = positive(1.0)
+    min_sightings: int = positive(8, whole=True)
+    min_seen_share: float = positive(0.7)
+    hidden_timeout: float = positive(3.0)
+    empty_place_timeout: float = positive(1.5)
+    candidate_timeout: float = positive(0.5)
 
 
 def deviation(covariance: Array) -> float:
@@ -320,7 +320,7 @@ class PersonTracker:
     def _find_legs(self, time: float, scan: Scan, pose: Array) -> _Legs:
         """Return the possible legs of a scan."""
         found = self._detector.find_candidates(scan)
-        likely = found.probability > self.config.possible
+        likely = found.probability > self.config.min_leg_probability
         position = to_frame(found.position[likely], pose)
         empty, occupied = self._history.count_evidence(time, position, pose)
         return _Legs(
@@ -337,7 +337,7 @@ class PersonTracker:
         states = np.array([h.state for h in self._hypotheses])
         moved = states.copy()
         moved[:, :2] += dt * states[:, 2:]
-        unseen = np.array([time - h.seen for h in self._hypotheses]) - dt > self.config.forgotten
+        unseen = np.array([time - h.seen for h in self._hypotheses]) - dt > self.config.candidate_timeout
         is_blocked = unseen & check_places(scan, to_sensor(moved[:, :2], pose), PERSON_OFFSETS_M)[0]
         moved[is_blocked, :2] = states[is_blocked, :2]
         transition = np.eye(4)
@@ -358,7 +358,9 @@ class PersonTracker:
         off = legs.position[None] - states[:, None]
         squared = np.einsum("hli,hij,hlj->hl", off, np.linalg.inv(spread), off)
         unseen = np.array([time - h.seen for h in self._hypotheses])
-        reach = self.config.reach + self.config.first_speed * np.maximum(unseen - self.config.forgotten, 0.0)
+        reach = self.config.reach + self.config.first_speed * np.maximum(
+            unseen - self.config.candidate_timeout, 0.0
+        )
         near = (squared < GATE_CHI2) & (np.hypot(off[..., 0], off[..., 1]) < reach[:, None])
         cost = (
             squared + np.log(np.linalg.det(spread) / self.config.one_leg**4)[:, None] + self._type_cost(legs)
@@ -469,10 +471,10 @@ class PersonTracker:
         seen_empty, _ = check_places(scan, to_sensor(places, pose), PERSON_OFFSETS_M)
         for hypothesis, is_empty in zip(self._hypotheses, seen_empty, strict=True):
             hypothesis.confirmed = hypothesis.confirmed or self._has_walked(hypothesis, time)
-            patience = self.config.patience_in_view if is_empty else self.config.patience
-            if time - hypothesis.seen <= (patience if hypothesis.confirmed else self.config.forgotten):
+            timeout = self.config.empty_place_timeout if is_empty else self.config.hidden_timeout
+            if time - hypothesis.seen <= (timeout if hypothesis.confirmed else self.config.candidate_timeout):
                 kept.append(hypothesis)
-        walkers = [h for h in kept if h.confirmed or h.moved > self.config.moved]
+        walkers = [h for h in kept if h.confirmed or h.moved > self.config.min_moved_share]
         self._hypotheses = [
             h for h in kept if h.confirmed or not any(_is_leg_of(h, other) for other in walkers)
         ]
@@ -481,18 +483,18 @@ class PersonTracker:
         """Return whether it moves like a person: on legs, steadily, to places that were empty."""
         config = self.config
         return (
-            hypothesis.moved > config.moved
-            and hypothesis.belief > config.belief
-            and hypothesis.surprise < config.surprise
-            and hypothesis.pairs > config.pairs
-            and time - hypothesis.born > config.watched
-            and hypothesis.sightings >= max(config.sightings, config.steady * hypothesis.scans)
-            and bool(np.hypot(*(hypothesis.state[:2] - hypothesis.origin)) > config.walked)
+            hypothesis.moved > config.min_moved_share
+            and hypothesis.belief > config.min_mean_probability
+            and hypothesis.surprise < config.max_mean_error
+            and hypothesis.pairs > config.min_pair_share
+            and time - hypothesis.born > config.min_age
+            and hypothesis.sightings >= max(config.min_sightings, config.min_seen_share * hypothesis.scans)
+            and bool(np.hypot(*(hypothesis.state[:2] - hypothesis.origin)) > config.min_distance)
         )
 
     def _is_plausible(self, hypothesis: _Hypothesis) -> bool:
         """Return whether an unconfirmed hypothesis is reported."""
-        return hypothesis.sightings > 2 and hypothesis.belief > self.config.belief
+        return hypothesis.sightings > 2 and hypothesis.belief > self.config.min_mean_probability
 
     def _make_track(self, hypothesis: _Hypothesis, time: float, pose: Array) -> Track:
         """Return the track in the frame of the given pose, or in the sensor frame."""

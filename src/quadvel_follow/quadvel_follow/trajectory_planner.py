@@ -55,12 +55,12 @@ class TrajectoryPlanner(Node):
         self._trajectory = settings.load()
         self.get_logger().info(f"{settings.file}: {self._trajectory.summary()}")
         self._follower = TrajectoryFollower(self._trajectory, settings.closed_loop)
-        self._closed = settings.closed_loop
+        self._closed_loop = settings.closed_loop
         self._pose: np.ndarray | None = None
         self._odom_received_at = -np.inf  # s
         self._started_at: float | None = None
         self._refusals = Refusals()
-        self._velocity = self.create_publisher(Twist, "cmd_vel", 10)
+        self._publisher = self.create_publisher(Twist, "cmd_vel", 10)
         self.create_subscription(Odometry, "odom", self._on_odom, qos_profile_sensor_data)
         self.create_timer(STEP_S, self._step)
 
@@ -76,7 +76,7 @@ class TrajectoryPlanner(Node):
 
     def _step(self) -> None:
         now = self._now()
-        if self._closed and now - self._odom_received_at > ODOM_TIMEOUT_S:
+        if self._closed_loop and now - self._odom_received_at > ODOM_TIMEOUT_S:
             if self._started_at is not None:
                 request_exit(self, f"trajectory_planner: odom is silent for more than {ODOM_TIMEOUT_S} s")
             return
@@ -89,11 +89,11 @@ class TrajectoryPlanner(Node):
             request_exit(self, f"trajectory_planner: {error}")
             return
         twist = Twist()
-        if velocity is None:
+        if velocity is None:  # the trajectory has ended: zero
             request_exit(self)
         else:
             twist.linear.x, twist.linear.y, twist.angular.z = velocity.tolist()
-        self._velocity.publish(twist)
+        self._publisher.publish(twist)
 
 
 def main(args: list[str] | None = None) -> None:

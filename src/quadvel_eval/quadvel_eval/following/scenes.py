@@ -100,10 +100,11 @@ def crossing(seed: int) -> FollowScene:
     rng = np.random.default_rng([13, seed])
     person = _person(rng, [[0.0, 0.0], [16.0, 0.0]], (0.9, 1.5))
     others = []
-    for at in rng.uniform(3.0, 14.0, 3):
+    for x in rng.uniform(3.0, 14.0, 3):
         side, speed = rng.choice([-1.0, 1.0]), rng.uniform(0.8, 1.3)
-        begin = side * speed * ((at + rng.uniform(0.4, 1.4)) / person.speed + INITIAL_STOP_DURATION_S)
-        way = [[at, begin], [at + rng.uniform(-0.5, 0.5), begin - side * 30.0]]
+        # So far to the side that the bystander crosses the path 0.4 to 1.4 m behind the person.
+        start_y = side * speed * ((x + rng.uniform(0.4, 1.4)) / person.speed + INITIAL_STOP_DURATION_S)
+        way = [[x, start_y], [x + rng.uniform(-0.5, 0.5), start_y - side * 30.0]]
         others.append(_walker(rng, way, (speed, speed)))
     posts = [[x, y, 0.15] for x in (2.0, 8.0, 14.0) for y in (-3.0, 3.0)]
     return FollowScene(
