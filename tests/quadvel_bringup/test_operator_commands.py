@@ -113,5 +113,5 @@ def test_an_order_without_an_answer_is_given_again_if_that_does_no_harm(
             assert client.asked == 3
         else:
             with pytest.raises(session.NotRunningError, match=r"/deaf: no answer within 0\.5 s"):
-                node.call(SetBool, ["deaf"], str, repeats=False, data=True)
+                node.call(SetBool, ["deaf"], str, may_retry=False, data=True)
             assert client.asked == 1

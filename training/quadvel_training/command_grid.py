@@ -38,7 +38,8 @@ class GridConfig:
         stance: share of commands to stand; setting off is where robots fall most.
         straight: share of commands without yaw.
         near: share of commands near rest, which are few among all cells.
-        axis: share of commands along one axis, the fastest ones among them; the rest may be any.
+        axis: share of commands along one axis only, where limits allow the highest speeds. What the
+            shares leave is drawn from all open cells.
         hold: s, from and to, until the next command.
         error_xy: m/s, mean error up to which a command at rest counts as followed.
         error_wz: rad/s, the same for yaw.

@@ -130,7 +130,7 @@ def step(milliseconds: int) -> int:
     Returns:
         The exit code.
     """
-    return _order_simulator("step", StepSim, repeats=False, steps=milliseconds)
+    return _order_simulator("step", StepSim, may_retry=False, steps=milliseconds)  # of 1 ms
 
 
 def push(force: tuple[float, float, float], seconds: float, body: str) -> int:
@@ -146,19 +146,19 @@ def push(force: tuple[float, float, float], seconds: float, body: str) -> int:
     """
     x, y, z = force
     wrench = Wrench(force=Vector3(x=x, y=y, z=z))
-    return _order_simulator("push", Push, repeats=False, body=body, wrench=wrench, duration=seconds)
+    return _order_simulator("push", Push, may_retry=False, body=body, wrench=wrench, duration=seconds)
 
 
-def _order_simulator(order: str, kind: Any, repeats: bool = True, **fields: Any) -> int:
-    """Call a service of the simulator. `repeats`: whether a repeated call does no harm."""
+def _order_simulator(order: str, kind: Any, may_retry: bool = True, **fields: Any) -> int:
+    """Call a service of the simulator. `may_retry`: see `Session.call`."""
     with Session(order) as session:
-        return _print_response(_call_simulator(session, order, kind, repeats, **fields))
+        return _print_response(_call_simulator(session, order, kind, may_retry, **fields))
 
 
-def _call_simulator(session: Session, order: str, kind: Any, repeats: bool = True, **fields: Any) -> Any:
+def _call_simulator(session: Session, order: str, kind: Any, may_retry: bool = True, **fields: Any) -> Any:
     """Call a service of the node that simulates the robot; returns the response."""
     services = [f"{node}/{order}" for node in SIMULATOR_NODES]
-    return session.call(kind, services, lambda: _missing_simulator(session), repeats, **fields)
+    return session.call(kind, services, lambda: _missing_simulator(session), may_retry, **fields)
 
 
 def _missing_simulator(session: Session) -> str:

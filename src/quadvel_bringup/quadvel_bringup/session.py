@@ -29,13 +29,13 @@ Discovery takes a second on a busy machine. If Fast DDS misses the first announc
 ones come 3 s later.
 """
 SERVICE_TIMEOUT_S = 10.0
-"""Time within which an available service answers."""
+"""Longest wait for the answer of an available service, retries included."""
 SERVICE_RETRY_S = 1.0
 """Time after which an unanswered request is repeated."""
 
 
 class NotRunningError(ConnectionError):
-    """A required node does not run; the sentence names the command that starts it."""
+    """A required node does not run or does not answer; the message says what is missing."""
 
 
 class Session:
@@ -128,7 +128,7 @@ class Session:
         kind: Any,
         services: Sequence[str],
         absent: Callable[[], str],
-        repeats: bool = True,
+        may_retry: bool = True,
         **fields: Any,
     ) -> Any:
         """Call the first available one of several services.
@@ -137,8 +137,9 @@ class Session:
             kind: Service class.
             services: Names of services.
             absent: Returns advice if no service is available.
-            repeats: Whether the request may be repeated without an answer: the first one is lost if
-                the server has not discovered this client yet.
+            may_retry: Whether the request may be sent again if no answer comes, because a repeated
+                call does no harm. The first request is lost if the server has not discovered this
+                client yet.
             fields: Fields of the request.
 
         Returns:
@@ -156,7 +157,7 @@ class Session:
         asked: list[Any] = []
         for wait in (
             repeat(SERVICE_RETRY_S, round(SERVICE_TIMEOUT_S / SERVICE_RETRY_S))
-            if repeats
+            if may_retry
             else (SERVICE_TIMEOUT_S,)
         ):
             asked.append(client.call_async(kind.Request(**fields)))

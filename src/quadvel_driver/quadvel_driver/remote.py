@@ -44,7 +44,7 @@ BUTTONS = {
     OperatorCommand.ALLOW_WALKING: Button.L1 | Button.RIGHT,
     OperatorCommand.FORBID_WALKING: Button.L1 | Button.LEFT,
 }
-"""Buttons of each command; the first match counts."""
+"""Buttons that must all be down for a command; the first command that matches counts."""
 
 
 @attrs.frozen(kw_only=True, slots=False)  # for multiple inheritance

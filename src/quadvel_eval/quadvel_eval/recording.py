@@ -57,7 +57,7 @@ class ControllerTrace:
     Attributes:
         time: Times (n,), s.
         mode: Names of the modes.
-        figures: LOOP_FIGURES of quadvel_msgs/ControllerState.
+        figures: Fields LOOP_FIGURES of each quadvel_msgs/ControllerState.
     """
 
     time: Array
@@ -75,7 +75,7 @@ class Recording:
         position: Position of the trunk (n, 3), m, world frame.
         quaternion: Orientation of the trunk (n, 4), w, x, y, z.
         velocity: True vx, vy, vz (m/s), wx, wy, wz (rad/s), body frame, (n, 6).
-        estimate: Estimated vx, vy, vz (n, 3), m/s.
+        estimate: Estimated vx, vy, vz (n, 3), m/s, body frame.
         joints: Joint angles (n, 12), rad.
         loop: Reports of the controller.
         answer_time: Time from a state to the command that answers it (n, 1), s.

@@ -1,4 +1,4 @@
-"""Writes results as JSON, CSV, pictures and tables; computes nothing.
+"""Writes results as JSON, CSV, pictures and tables; runs no simulation.
 
 Each file is replaced atomically. Other files of the folder are kept.
 """
@@ -192,7 +192,9 @@ AGGREGATES: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "runs, falls": lambda one: f"{len(one['cells'])}, {one['falls']}",
     "error, mean and largest": lambda one: f"{one['mean_error_xy']:.3f}, {one['max_error_xy']:.3f} m/s",
     "largest at (vx, vy, wz)": lambda one: _worst_command(one, "error_xy"),
-    "yaw rate, mean and largest": lambda one: f"{one['mean_error_wz']:.3f}, {one['max_error_wz']:.3f} rad/s",
+    "yaw rate error, mean and largest": lambda one: (
+        f"{one['mean_error_wz']:.3f}, {one['max_error_wz']:.3f} rad/s"
+    ),
     "largest at (vx, vy, wz) ": lambda one: _worst_command(one, "error_wz"),
     "delay of the velocity": lambda one: _seconds(one["delay_xy"]),
     "delay of the yaw rate": lambda one: _seconds(one["delay_wz"]),

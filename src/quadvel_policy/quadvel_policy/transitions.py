@@ -92,67 +92,67 @@ Precondition = Callable[[Situation], str]
 """Returns why a transition is refused, one sentence; "" if it is not. Its docstring labels the diagram."""
 
 
-def _auto_stand_is_pending(now: Situation) -> str:
+def _require_pending_auto_stand(now: Situation) -> str:
     """`auto_stand`, once."""
     return "" if now.auto_stand else "the robot has stood up by itself, or must not"
 
 
-def _path_has_ended(now: Situation) -> str:
+def _require_ended_path(now: Situation) -> str:
     """The posture is reached."""
     return "" if now.path_ended else "the robot is on its way to the posture"
 
 
-def _is_in_nominal_posture(now: Situation) -> str:
+def _require_nominal_posture(now: Situation) -> str:
     """The joints are near the nominal posture."""
     return now.posture_error
 
 
-def _is_off_nominal_posture(now: Situation) -> str:
+def _require_other_posture(now: Situation) -> str:
     """A joint is off the nominal posture."""
     return "" if now.posture_error else "the joints are near the nominal posture"
 
 
-def _velocity_is_commanded(now: Situation) -> str:
+def _require_commanded_velocity(now: Situation) -> str:
     """A velocity is commanded."""
-    command = now.mode_input.command
+    command = now.mode_input.command  # vx, vy, yaw rate, and 1 to stand
     return "" if not command[3] and command[:3].any() else "no velocity is commanded"
 
 
-def _velocity_is_known(now: Situation) -> str:
+def _require_known_velocity(now: Situation) -> str:
     """The velocity is known."""
     return "there is no fresh velocity estimate" if now.mode_input.velocity is None else ""
 
 
-def _is_not_stopped(now: Situation) -> str:
+def _require_no_stop(now: Situation) -> str:
     """No stop is latched."""
     if now.latch.cause is None:
         return ""
     return f"the robot was stopped ({now.latch.sentence}): request stance when that is mended"
 
 
-def _is_stopped(now: Situation) -> str:
+def _require_stop(now: Situation) -> str:
     """A stop is latched."""
     return "" if now.latch.cause else "no fault stopped the robot"
 
 
-def _walking_is_allowed(now: Situation) -> str:
+def _require_permission_to_walk(now: Situation) -> str:
     """Walking is allowed."""
     return "" if now.is_walking_allowed else "walking is not allowed yet: call ~/enable_walking"
 
 
-def _neutral_was_seen(now: Situation) -> str:
+def _require_zero_command_seen(now: Situation) -> str:
     """A zero velocity was commanded."""
     return "" if now.neutral_seen else "a zero velocity has to be commanded first"
 
 
-def _stands_on_command(now: Situation) -> str:
+def _require_commanded_stand(now: Situation) -> str:
     """The robot stands, as commanded."""
     if now.mode_input.command[3] and now.speed <= now.config.max_standing_speed:
         return ""
     return f"the robot walks ({now.speed:.2f} m/s), command stance first"
 
 
-def _has_braked(now: Situation) -> str:
+def _require_braked(now: Situation) -> str:
     """It has braked for `brake_time`, longer if it still moves."""
     braking, limit = now.mode_input.state.time - now.latch.since, now.config.brake_time
     if braking >= limit and (
@@ -180,32 +180,33 @@ class Automatic:
 REQUESTED: dict[tuple[str, str], tuple[Precondition, ...]] = {
     ("passive", "stand_up"): (),
     ("lie_down", "stand_up"): (),
-    ("passive", "stance"): (_is_in_nominal_posture,),
-    ("walk", "stance"): (_stands_on_command,),
-    ("stance", "walk"): (_is_not_stopped, _walking_is_allowed, _velocity_is_known),
+    ("passive", "stance"): (_require_nominal_posture,),
+    ("walk", "stance"): (_require_commanded_stand,),
+    ("stance", "walk"): (_require_no_stop, _require_permission_to_walk, _require_known_velocity),
     ("stand_up", "lie_down"): (),
     ("stance", "lie_down"): (),
-    ("walk", "lie_down"): (_stands_on_command,),
+    ("walk", "lie_down"): (_require_commanded_stand,),
 }
 """Preconditions of each transition that may be requested; passive may be requested from every mode."""
 
 AUTOMATIC: dict[tuple[str, str], Automatic] = {
     ("passive", "stand_up"): Automatic(
-        (_auto_stand_is_pending,), lambda now: "stands up by itself at the start"
+        (_require_pending_auto_stand,), lambda now: "stands up by itself at the start"
     ),
     ("stand_up", "stance"): Automatic(
-        (_path_has_ended, _is_in_nominal_posture), lambda now: now.latch.sentence or "stood up"
+        (_require_ended_path, _require_nominal_posture), lambda now: now.latch.sentence or "stood up"
     ),
     ("stand_up", "fault"): Automatic(
-        (_path_has_ended, _is_off_nominal_posture),
+        (_require_ended_path, _require_other_posture),
         lambda now: f"standing up failed: {now.posture_error}",
         fault="stand_up_failed",
     ),
     ("stance", "walk"): Automatic(
-        (_velocity_is_commanded, _velocity_is_known, _path_has_ended), lambda now: "a velocity was commanded"
+        (_require_commanded_velocity, _require_known_velocity, _require_ended_path),
+        lambda now: "a velocity was commanded",
     ),
-    ("walk", "stance"): Automatic((_is_stopped, _has_braked), lambda now: now.latch.sentence),
-    ("lie_down", "passive"): Automatic((_path_has_ended,), lambda now: "lies"),
+    ("walk", "stance"): Automatic((_require_stop, _require_braked), lambda now: now.latch.sentence),
+    ("lie_down", "passive"): Automatic((_require_ended_path,), lambda now: "lies"),
 }
 """Transitions by themselves. No transition leads to a mode that a present fault would end at once."""
 
@@ -270,7 +271,7 @@ def walk_refusal(now: Situation) -> str:
         return "the robot is in fault: request passive, then stand_up"
     if now.mode not in VELOCITY_MODES:
         return f"the robot is in mode {now.mode}, expected {' or '.join(VELOCITY_MODES)}"
-    return _first_refusal((_is_not_stopped, _walking_is_allowed, _neutral_was_seen), now)
+    return _first_refusal((_require_no_stop, _require_permission_to_walk, _require_zero_command_seen), now)
 
 
 def _first_refusal(preconditions: Iterable[Precondition], now: Situation) -> str:

@@ -26,7 +26,7 @@ from .logs.log import Log
 from .logs.read_log import read_log
 from .logs.readers.columns import ColumnMap
 from .logs.readers.recordings import Topics
-from .memory import keep_freed_arrays, return_large_arrays
+from .memory import return_freed_arrays_to_system, reuse_freed_arrays
 from .options import IdentifyOptions
 from .statistics.baselines import FILTER_SPAN_S
 
@@ -39,8 +39,8 @@ MULTI_VALUE_OPTIONS = ("--holdout", "--joints")
 DEFAULT_CORES = 2
 """Worker processes unless `--cores` asks for more; each one takes about 200 MB."""
 _LONG_LOG_VALUES = 1_000_000
-"""Values of q in all logs, from which low memory matters more than time: ten minutes of twelve
-joints take less than 1 GB.
+"""Number of values of q (samples times joints) from which logs count as long: freed memory goes
+back to the system, and one worker is the default.
 """
 STYLE = {"note": "dim", "warning": "yellow", "refusal": "red"}
 """Style of each kind of finding in the terminal."""
@@ -135,7 +135,9 @@ def identify(
     ] = None,
     cores: Annotated[
         int | None,
-        typer.Option(min=1, help="Worker processes.", show_default=f"min({DEFAULT_CORES}, cores)"),
+        typer.Option(
+            min=1, help="Worker processes.", show_default=f"min({DEFAULT_CORES}, cores), 1 for long logs"
+        ),
     ] = None,
 ) -> None:
     """Find what the actuator model lacks, from measured logs of joints.
@@ -164,7 +166,7 @@ def identify(
     messages = Console(stderr=True)
     try:
         output_folder(out)
-        return_large_arrays()
+        return_freed_arrays_to_system()
         names = ColumnMap() if columns is None else ColumnMap.load(columns)
         read = partial(read_log, joints=joints, names=names, topics=Topics(state_topic, command_topic))
         parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
@@ -204,7 +206,7 @@ def _identify(
 
         dataset, long = prepare()
         if not long:
-            keep_freed_arrays()
+            reuse_freed_arrays()
         from .identify import identify_dataset
 
         cores = cores or (1 if long else min(DEFAULT_CORES, len(os.sched_getaffinity(0))))

@@ -15,7 +15,7 @@ _LARGE_BYTES, _LARGEST_BYTES, _KEPT_BYTES = 1 << 22, 1 << 25, 1 << 27
 """Bytes: smallest array that is mapped separately, largest threshold, and memory kept at the top."""
 
 
-def return_large_arrays() -> None:
+def return_freed_arrays_to_system() -> None:
     """Return large arrays to the system as soon as they are freed.
 
     By default glibc raises its threshold with the size of freed arrays, and keeps them with gaps
@@ -24,7 +24,7 @@ def return_large_arrays() -> None:
     _set(M_MMAP_THRESHOLD, _LARGE_BYTES)
 
 
-def keep_freed_arrays() -> None:
+def reuse_freed_arrays() -> None:
     """Keep freed memory for the next arrays."""
     _set(M_MMAP_THRESHOLD, _LARGEST_BYTES)
     _set(M_TRIM_THRESHOLD, _KEPT_BYTES)

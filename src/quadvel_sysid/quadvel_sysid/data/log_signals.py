@@ -37,21 +37,22 @@ class LogSignals:
         signals: All of these signals by name.
     """
 
-    def __init__(self, log: Log, steady: float, known: Collection[str], sharp: bool) -> None:
+    def __init__(self, log: Log, smoothing: float, known: Collection[str], sharp: bool) -> None:
         """Prepare the signals.
 
         Args:
             log: The log.
-            steady: Half width of the lines that smooth q and dq, s; 0 for none.
+            smoothing: Half width of the window of the lines fitted to q and dq, s; 0 for none.
+                Accelerations use the raw dq. `preparation` selects it.
             known: Which of kp and kd are used as logged.
             sharp: Whether accelerations are kept sharp where a command arrives.
         """
         self.log, self.origin = log, float(log.t[0]) if log.recording_start is None else log.recording_start
         self.t, self.t_cmd = as_double(log.t), as_double(log.t_cmd)
         self.states = {"q": as_double(log.q), "dq": as_double(log.dq)}
-        if steady > 0.0:
+        if smoothing > 0.0:
             self.states = {
-                k: local_lines(as_double(log.t), values, steady)[0] for k, values in self.states.items()
+                k: local_lines(as_double(log.t), values, smoothing)[0] for k, values in self.states.items()
             }
         if log.temperature is not None:
             self.states["temperature"] = as_double(log.temperature)
@@ -117,7 +118,8 @@ class LogSignals:
         """Compute the acceleration of the joints.
 
         Args:
-            name: `ddq`, `ddq_sharp` or `ddq_smooth`; selects the half width of the slope.
+            name: `ddq`, `ddq_sharp` or `ddq_smooth`; selects the half width of the slope, and for
+                the latter two whether steps at commands are kept sharp.
             at: (N,) times, s.
             delays: (J,) delay from a command to the motion of its joint, s.
             joints: Columns to read.
@@ -131,14 +133,14 @@ class LogSignals:
         if key not in self._smooth:
             if len(self._smooth) >= _MAX_CACHED_SLOPES:
                 self._smooth.pop(next(iter(self._smooth)))
-            acting = self._read_targets(self.t, delays, self._integral)
+            target_integral = self._read_targets(self.t, delays, self._integral)
             self._smooth[key] = split_acceleration(
-                name, self.t, as_double(self.log.dq), self._slope_of_dq(name), acting
+                name, self.t, as_double(self.log.dq), self._slope_of_dq(name), target_integral
             )
         # ddq = smooth + B q_des, with the command as it acts at `at`.
-        smooth, answer = self._smooth[key]
-        jumps = self._read_targets(at, delays, lambda values, _, sent: values[self.command_rows(sent)])
-        return interpolation.interpolate(smooth[:, joints], *self.locate(at)) + jumps @ answer[:, joints]
+        smooth, response = self._smooth[key]
+        targets = self._read_targets(at, delays, lambda values, _, sent: values[self.command_rows(sent)])
+        return interpolation.interpolate(smooth[:, joints], *self.locate(at)) + targets @ response[:, joints]
 
     def _slope_of_dq(self, name: str) -> Array:
         """Slope of dq at each row, rad/s^2, as smooth as `name` says."""
@@ -148,7 +150,7 @@ class LogSignals:
         return self._slopes[width]
 
     def _read_targets(self, at: Array, delays: Array, read: Callable[[Array, Array, Array], Array]) -> Array:
-        """Read q_des and its integral at the send times of what acts at `at`, (N, J)."""
+        """Apply `read` to q_des and its integral at the time `at` minus the delay of each joint, (N, J)."""
         found = np.zeros((len(at), len(delays)))
         if "q_des" in self.sums:
             for delay in np.unique(delays):
@@ -163,7 +165,7 @@ class LogSignals:
         Args:
             name: Name of the signal.
             at: (N,) times, s.
-            late: (..., J) delays, s.
+            late: (..., J) delays, s; values are those at `at` minus these.
 
         Returns:
             (..., N, J) values.
@@ -209,8 +211,8 @@ class LogSignals:
             return values[self.command_rows(at) if row is None else row]
         # Mean of the held command over the step: (I(at + window) - I(at)) / window.
         sums = self.sums[name][:, joints]
-        late, early = (self._integral(values, sums, end) for end in (at + window, at))
-        return (late - early) / window
+        end, start = (self._integral(values, sums, time) for time in (at + window, at))
+        return (end - start) / window
 
     def _integral(self, values: Array, sums: Array, at: Array) -> Array:
         """Integral of a command signal from the first command to `at`."""

@@ -226,7 +226,7 @@ class RegressorCandidate(EffectCandidate):
 
     @override
     def allowed_joints(self, joints: Sequence[str]) -> Bools:
-        """Return the joints but the owner of the signal, which is no neighbour of itself."""
+        """Return all joints except the one that owns the signal."""
         owner = self.effect.of.rpartition("/")[0]
         return np.array([name != owner for name in joints])
 

@@ -1,4 +1,7 @@
-"""Make a log from named arrays: equal shapes, one time base for all commands."""
+"""Make a log from named arrays: equal shapes, one time base for all commands.
+
+`files.READERS` has a module for each file format; here their arrays become a `Log`.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +51,9 @@ def read_table(path: Path, names: ColumnMap) -> Log:
 def drop_repeated_times(
     field: str, time: Floats, values: Mapping[str, Any], remarks: list[str]
 ) -> tuple[Floats, dict[str, Any]]:
-    """Drop rows whose time equals that of the row before.
+    """Drop rows whose time equals that of the row before, if these are fewer than half of the rows.
+
+    Where they are more, the time stamps are unusable, and `Log` refuses them.
 
     Args:
         field: Name of the time base, for the remark.
@@ -74,9 +79,9 @@ def drop_repeated_times(
 def _log(path: Path, fields: dict[str, Any], names: list[str] | None, remarks: list[str]) -> Log:
     """Make a log from the fields."""
     if "t_cmd" in fields and "q_des_cmd" not in fields:
-        remarks.append("t_cmd: not used, as q_des_cmd is not there; q_des counts on the times t")
+        remarks.append("t_cmd: not used, as q_des_cmd is not there; q_des is taken at the times t")
     t, q = fields["t"], fields["q"]
-    if q.ndim == 1 == (1 if names is None else len(names)):
+    if q.ndim == 1 and (names is None or len(names) == 1):  # of a single joint
         q = q[:, None]
     if t.ndim != 1 or q.ndim != 2 or len(q) != len(t):
         raise LogError(f"{path}: q: found shape {q.shape}, expected ({t.size}, J): a row for each of t")

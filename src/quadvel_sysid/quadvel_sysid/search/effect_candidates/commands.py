@@ -20,14 +20,14 @@ from ...model.effect_candidate import EffectCandidate, FormContext, InitialGuess
 
 @attrs.frozen(eq=False)
 class InferredCommandLoss(ErrorEffect):
-    """Expected effect of commands that acts late or never, given the odds of each row.
+    """Expected effect of commands that arrive late or never, from their probabilities at each row.
 
     Which commands were lost is inferred from the measured torque, so `odds` are a posterior given
     this log and not available for prediction. A running model draws its losses at random.
 
     Attributes:
-        odds: (N, J, M), probability that the drive is 0, 1, ... commands behind at each row.
-        usual: (M,), the same for any row.
+        odds: (N rows, J joints, M), probability that the drive is 0, 1, ... commands behind at each row.
+        usual: (M,), their mean over the fitted rows, used for prediction.
     """
 
     name = CommandHold.name
@@ -42,6 +42,7 @@ class InferredCommandLoss(ErrorEffect):
 
     @override
     def errors(self, e: Errors, s: Any, p: Params) -> Errors:
+        # `share` is not needed: the odds are given. It is estimated for the running `CommandHold`.
         odds, joint = self.odds[s.row[:, 0]], np.arange(s.q.shape[-1])
         # Expected position target given the odds p_b of being b commands behind:
         #     q_des + sum_b p_b (sent[packet - b] - q_des)
