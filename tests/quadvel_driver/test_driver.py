@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import subprocess
+import sys
 import threading
 import time
 from collections import defaultdict
@@ -349,3 +350,21 @@ def test_a_bad_parameter_ends_the_start_with_one_sentence(
     assert process.returncode == 2
     assert sentence in text
     assert len(text.strip().splitlines()) == 1
+
+
+DYING_LINK = """
+import quadvel_dds
+quadvel_dds.install()
+from quadvel_driver import driver, link
+def die(self):
+    raise OSError("the network card is gone")
+link.UdpLink.run = die
+driver.main()
+"""
+
+
+def test_a_dry_run_whose_link_dies_ends_with_the_cause() -> None:
+    command = [sys.executable, "-c", DYING_LINK, "--ros-args", "-p", "dry_run:=true"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60.0)
+    assert ended.returncode != 0
+    assert "the network card is gone" in ended.stdout + ended.stderr

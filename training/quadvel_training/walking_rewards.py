@@ -133,12 +133,12 @@ class WalkingWeights:
             step.
         angular: exp(-e^2 / (0.25 rad^2/s^2 (1 + |c| / 4))), yaw.
         angular_narrow: exp(-e^2 / 0.04 rad^2/s^2), yaw.
-        stride_linear: penalty, s/m, of the error over a stride, xy.
+        stride_linear: penalty, s/m, of the error low-passed over 0.35 s (`STRIDE_S`), xy.
         stride_angular: penalty, s/rad, of the error over a stride, yaw.
-        lasting_linear: penalty, s/m, of the lasting error, xy.
+        lasting_linear: penalty, s/m, of the error low-passed over 1.5 s (`LASTING_S`), xy.
         lasting_angular: penalty, s/rad, of the lasting error, yaw.
         steady: exp(-(e / 0.06)^2) of the lasting error, xy and yaw.
-        bounce: penalty of the vertical speed squared.
+        bounce: penalty of the trunk's speed along its own z axis, squared.
         rocking: penalty of roll and pitch rate squared.
         tilt: penalty of roll and pitch relative to the ground, squared.
         height: penalty of the height error squared.
@@ -252,7 +252,7 @@ class WalkingRewards:
         """Evaluate all weighted rewards after a sample; call it once per sample.
 
         Args:
-            command: (n, 4), command in force.
+            command: (n, 4), command in force: vx, vy (m/s), yaw rate (rad/s), 1 to stand.
             past: low-passed errors and foot timing of the robots.
             air: (n, 4), s in the air before the sample.
             actions: (3, n, 12), of this sample and the two before.
@@ -289,8 +289,8 @@ class WalkingRewards:
         """Rewards of trunk motion and smoothness."""
         env, w = self.env, self.weights
         down_forward, down_left = env.ground_slope.T
-        # attitude of a trunk parallel to the ground: roll = atan(-slope_left), pitch =
-        # atan(slope_forward)
+        # Drop of the ground per metre forward and left. A trunk parallel to the ground has
+        # roll = atan(-down_left), pitch = atan(down_forward).
         lean = np.arctan(np.stack([-down_left, down_forward], axis=1))
         acceleration = (env.dq - self._dq) / env.config.period
         self._dq = env.dq.copy()

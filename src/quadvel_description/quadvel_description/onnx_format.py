@@ -24,11 +24,13 @@ FLOAT32 = 1
 
 INT, FLOAT, TEXT, BYTES = "int", "float", "text", "bytes"
 OPAQUE = "opaque"
-"""Numbers that nobody here looks at, in any encoding."""
+"""Numbers that are written back byte for byte, in any encoding."""
 UNREAD = "unread"
-"""A message that is not looked into; `network_file` refuses it."""
+"""A message kept as bytes, so that `network_file` can refuse it."""
 WIRE_TYPES = {INT: 0, FLOAT: 5}
 """Encoding of numbers: a varint, four bytes. All other kinds have 2: length and bytes."""
+FIXED_BYTES = {1: 8, 5: 4}
+"""Length of a value by its encoding."""
 
 
 @attrs.frozen
@@ -242,8 +244,10 @@ class _Reader:
             elif wire_type == 2:
                 length, position = self._varint(position, end)
                 after = position + length
+            elif wire_type in FIXED_BYTES:
+                after = position + FIXED_BYTES[wire_type]
             else:
-                after = position + {1: 8, 5: 4}.get(wire_type, end)
+                raise FormatError
             if after > end:
                 raise FormatError
             if number in known:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import gc
 import time
 from collections import deque
+from functools import partial
 from threading import Thread
 from typing import Any
 
@@ -72,8 +73,7 @@ class Driver(Node):
         self.create_subscription(LowCmd, "low_cmd", self._on_command, 1)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if self._dry_run:  # it may run next to a simulator, so it must not publish as a robot
-            show = self._dry_run.summary
-            self.create_timer(1.0, lambda: self.get_logger().info(show()), clock=steady)
+            self.create_timer(1.0, partial(self._show, self._dry_run), clock=steady)
         else:
             self._create_publishers()
             self.create_timer(OPERATOR_PERIOD_S, self._serve_operator, clock=steady)
@@ -199,10 +199,20 @@ class Driver(Node):
         """Return whether the newest data of the remote is too old to be used."""
         return self._newest is None or time.monotonic() - self._newest.robot.time > SILENCE_LIMIT_S
 
-    def _report(self) -> None:
-        """Publish /diagnostics, at 1 Hz."""
+    def _has_failed(self) -> bool:
+        """Return whether the link has ended by an error; the node then ends, too."""
         if self._failure:
             request_exit(self, f"driver: {self._failure}")
+        return bool(self._failure)
+
+    def _show(self, dry_run: DryRun) -> None:
+        """Log the packets that a dry run keeps back, at 1 Hz."""
+        if not self._has_failed():
+            self.get_logger().info(dry_run.summary())
+
+    def _report(self) -> None:
+        """Publish /diagnostics, at 1 Hz."""
+        if self._has_failed():
             return
         report = self._link.report()
         level, summary = self._health.assess(report, self._newest, self._pilot.stopped)

@@ -9,6 +9,9 @@ from quadvel_description.robot import KINDS, LEGS
 
 from . import wire
 
+SHOWN_BYTES = 11
+"""Header (10 bytes) and mode of the first motor."""
+
 
 class DryRun(socket.socket):
     """Replacement for the link's socket that keeps the last packet, sends nothing and receives nothing."""
@@ -40,11 +43,16 @@ class DryRun(socket.socket):
             The number of packets and a description of the last one.
         """
         count, self._count = self._count, 0
+        if not self._packet:
+            return "no packet yet"
         return f"{count} packets would have been sent, the last: {describe_packet(self._packet)}"
 
 
 def describe_packet(packet: bytes) -> str:
     """Describe a command packet: its first and last bytes, and one line per leg.
+
+    Angles (rad) are those of the drives: joint angle plus `joint_zeros` of the calibration, clamped
+    for the board. Speeds are in rad/s, torques in N m.
 
     Args:
         packet: A packet of `wire.encode_command`.
@@ -54,7 +62,7 @@ def describe_packet(packet: bytes) -> str:
     """
     command = wire.decode_command(packet)
     lines = [
-        f"{len(packet)} bytes, {packet[:11].hex()} ... CRC 0x{int.from_bytes(packet[-4:], 'little'):08X}"
+        f"{len(packet)} bytes, {packet[:SHOWN_BYTES].hex()} ... CRC 0x{int.from_bytes(packet[-4:], 'little'):08X}"
     ]
     for leg, name in enumerate(LEGS):
         joints = []

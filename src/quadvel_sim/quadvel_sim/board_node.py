@@ -46,7 +46,7 @@ class BoardNode(SimulationNode[BoardParameters]):
         super().destroy_node()
 
     @override
-    def publish_sample(self, state: RobotState, instant: float, view: bool) -> None:
+    def publish_sample(self, state: RobotState, instant: float, view_is_due: bool) -> None:
         self._board.publish(state, instant)
 
     @override

@@ -45,14 +45,14 @@ class SimNode(SimulationNode[SimParameters]):
         self.start()
 
     @override
-    def publish_sample(self, state: RobotState, instant: float, view: bool) -> None:
+    def publish_sample(self, state: RobotState, instant: float, view_is_due: bool) -> None:
         stamp = self.stamp(instant)
         if self._settings.mode != REALTIME:
             self._clock_publisher.publish(ClockMessage(clock=stamp))
         message = LowState(stamp=stamp)
         write_low_state(state, message)
         self._low_state.publish(message)
-        if view:
+        if view_is_due:
             self._view.publish(stamp, state)
 
     @override

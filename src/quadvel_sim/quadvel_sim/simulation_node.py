@@ -102,13 +102,13 @@ class SimulationNode(Node, ABC, Generic[Settings]):
     # Interface of the subclasses.
 
     @abstractmethod
-    def publish_sample(self, state: RobotState, instant: float, view: bool) -> None:
+    def publish_sample(self, state: RobotState, instant: float, view_is_due: bool) -> None:
         """Publish one state; called in the thread of the simulation.
 
         Args:
             state: State of the robot.
-            instant: Time of the state, s, see `SimulationLoop`.
-            view: Whether topics for display are due, too.
+            instant: Time of the state, s: of the monotonic clock in real time, else simulated.
+            view_is_due: Whether topics for display are due, too.
         """
 
     @abstractmethod

@@ -50,7 +50,7 @@ class TorqueSpeedLimit(TorqueEffect):
 class SlewLimit(MemoryEffect):
     """Rate limit: |dtau/dt| <= rate.
 
-    If a new command arrives within a step, the torque keeps its earlier slope until then.
+    If a new command arrives within a step, the input keeps the slope of the step before until then.
     """
 
     name = "slew_limit"

@@ -1,4 +1,7 @@
-"""Checks of the time stamps: units, clocks that were set, rates, gaps and lost rows."""
+"""Checks of the time stamps: units, clocks that were set forward, rates, gaps and lost rows.
+
+`Log` itself refuses times that do not rise.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from ..log import GAP_FACTOR, Log
 COMMAND_GAP_S = 0.1
 """s without a command that make a gap in a regular stream of commands."""
 MAX_GAP_S = 86_400.0
-"""s; a longer step means that the clock was set."""
+"""s; a longer step means that the clock was set forward."""
 MAX_SPAN_RATIO = 30.0
 """Span of the commands over that of the states, above which they have different units or recordings."""
 MAX_PERIOD_S, MIN_PERIOD_S = 0.5, 1e-5
