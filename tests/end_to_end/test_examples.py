@@ -152,6 +152,7 @@ LEFT_OUT_KINDS = {
     r"mkdir -p out/checkpoints .*": "takes a checkpoint out of the history",
     r"((driver|controller|command_mux|ros__parameters):|(stick_velocity|max_tilt|max_velocity): .*)": "a part of a parameter "
     "file; test_yaml_examples.py loads it",
+    r"\[project\.entry-points\..*|magnetic_drag = .*": "a part of another package's pyproject.toml; tests/quadvel_sysid has one",
     r"(t|q|dq|tau|kp|q_des|t_cmd|q_des_cmd|joint_names): .*": "a part of a map file for --columns",
 }
 

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import attrs
 
-from quadvel_description.fields import field
-
 from .nodes import Parameters, process_command, ros_arguments
 
 PARAMETERS = Path(__file__).parent / "config" / "params.yaml"
@@ -81,7 +79,7 @@ class Stack:
         network: Parameters of "board" for a bad network.
     """
 
-    low_level: str = field("sim", one_of=LOW_LEVELS)
+    low_level: str = attrs.field(default="sim", validator=attrs.validators.in_(LOW_LEVELS))
     parameters: Path = attrs.field(default=PARAMETERS, converter=Path)
     policy: Path | None = None
     terrain: str | None = None

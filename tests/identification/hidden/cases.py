@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.arrays import Array
 from tests.identification.hidden import worth
 from tests.identification.hidden.effect import Draw, Effect
 from tests.identification.hidden.known import KNOWN
 from tests.identification.hidden.motion import LEGS, Motion, joint_names, make_motion
 from tests.identification.hidden.outside import OUTSIDE
 from tests.identification.hidden.plant import Body, Drive, Trace, arrivals, simulate
+
+Array = NDArray[np.float64]
 
 COARSE = 0.001  # s, for looking how large an effect is; a case itself is made with 0.25 ms
 LEAST, MOST = 0.3, 6.0  # times the noise

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.arrays import Array
+Array = NDArray[np.float64]
 
 LINK = 0.25  # m, thigh and calf of the AlienGo
 HIP_OFFSET = 0.0868  # m

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.arrays import Array
+Array = NDArray[np.float64]
 
 Step = Callable[[int, float], float]
 

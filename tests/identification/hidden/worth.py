@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.arrays import Array
 from tests.identification.hidden.plant import Trace
+
+Array = NDArray[np.float64]
 
 Ticks = NDArray[np.int64]
 
