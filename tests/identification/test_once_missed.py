@@ -11,12 +11,12 @@ from tests.identification.verdicts import score_report
     ("kind", "index", "seed"),
     [
         ("velocity_filter", 0, 17),  # with wrong delays of 20 ms its score is low
-        (
-            "torque_saturation",
-            0,
-            606,
+        pytest.param(
+            "torque_saturation", 0, 606, marks=pytest.mark.long
         ),  # it biased the delays of the plain fit by 10 ms, beyond the grid
-        ("soft_stop", 1, 913),  # a spring and less than a period of cogging can form any curve
+        pytest.param(
+            "soft_stop", 1, 913, marks=pytest.mark.long
+        ),  # a spring and less than a period of cogging can form any curve
         ("backlash", 2, 912),  # backlash fits later commands nearly as well as the true ones
         pytest.param(
             "triple", 0, 606, marks=pytest.mark.long

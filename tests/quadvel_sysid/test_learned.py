@@ -24,6 +24,8 @@ MARKS = {
     "friction_that_wears_in": pytest.mark.long,
     "resonance": pytest.mark.long,
     "rubbing": pytest.mark.long,
+    "hum": pytest.mark.long,
+    "ripple_on_a_neighbour": pytest.mark.long,
 }
 
 

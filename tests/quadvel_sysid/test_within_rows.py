@@ -83,7 +83,9 @@ def test_a_filtered_velocity_is_simulated_between_rows():
     assert np.abs(predicted + filtered)[settled].max() < 0.01
 
 
-@pytest.mark.parametrize(("channel", "late"), [("q", -0.009), ("dq", 0.01)])
+@pytest.mark.parametrize(
+    ("channel", "late"), [pytest.param("q", -0.009, marks=pytest.mark.long), ("dq", 0.01)]
+)
 def test_a_channel_stamped_early_or_late_on_one_joint_is_found(channel, late):
     truth = attrs.evolve(parameters(input_delay=0.009, output_delay=0.003), joints=NAMES[:3])
     log = record(truth, 3, 4.0, 500, "mixed", 2)
