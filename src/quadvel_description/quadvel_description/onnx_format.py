@@ -130,7 +130,11 @@ class Message:
         return values[0] if values else default
 
     def is_readable(self) -> bool:
-        """Return whether all texts of this message are UTF-8."""
+        """Check the texts of this message, not those of messages in it.
+
+        Returns:
+            Whether all are UTF-8.
+        """
         texts = [field.name for field in MESSAGES[self.kind].values() if field.kind == TEXT]
         return not any(isinstance(value, bytes) for name in texts for value in self.all(name))
 

@@ -201,6 +201,8 @@ AUTOMATIC: dict[tuple[str, str], Automatic] = {
         lambda now: f"standing up failed: {now.posture_error}",
         fault="stand_up_failed",
     ),
+    # The supervisor replaces a velocity by "stand" until a zero command was seen with walking allowed
+    # and no stop latched.
     ("stance", "walk"): Automatic(
         (_require_commanded_velocity, _require_known_velocity, _require_ended_path),
         lambda now: "a velocity was commanded",
