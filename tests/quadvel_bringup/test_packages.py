@@ -52,7 +52,7 @@ PIP = {
     "yaml": "pyyaml",
 }
 """Distributions that bring modules; of the module's name unless given"""
-BESIDE = {"setuptools"}
+BUILD_TOOLS = {"setuptools"}
 """Of every setup.py"""
 OPTIONAL = {"quadvel_eval", "quadvel_follow", "quadvel_lab", "quadvel_sim", "quadvel_sysid"}
 """What quadvel_bringup names as texts: its commands and nodes refuse to start where it is not installed"""
@@ -102,7 +102,7 @@ def used(package: str) -> set[str]:
         definitions = [*(SRC / package).glob("msg/*.msg"), *(SRC / package).glob("srv/*.srv")]
         lines = "\n".join(file.read_text() for file in definitions)
         return set(re.findall(r"^([a-z0-9_]+)/\w+", lines, re.MULTILINE))
-    found = imported(SRC / package) - set(sys.stdlib_module_names) - BESIDE - {package}
+    found = imported(SRC / package) - set(sys.stdlib_module_names) - BUILD_TOOLS - {package}
     return found - OPTIONAL if package == "quadvel_bringup" else found
 
 

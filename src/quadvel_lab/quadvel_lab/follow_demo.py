@@ -74,25 +74,14 @@ class FollowedWalk(RecordedRun):
         self._seconds, self._began = seconds, float("inf")
         self._created, self._last_state = time.monotonic(), "no state of the follow planner"
 
+    @override
     def listen(self, node: Any) -> None:
-        """Subscribe to the state of the follower.
-
-        Args:
-            node: The recorder's node.
-        """
         from std_msgs.msg import String
 
         node.create_subscription(String, "follow_planner/state", self._on_state, 10)
 
+    @override
     def is_over(self, ended: Mapping[str, int]) -> bool:
-        """Return whether the time has passed and all nodes run.
-
-        Args:
-            ended: Exit codes of ended processes by name.
-
-        Returns:
-            True at the end.
-        """
         return not ended and time.monotonic() - self._began > self._seconds
 
     @override

@@ -157,42 +157,42 @@ class HiddenDrives(ActuatorModel):
         self._draws = np.random.default_rng(seed)
         self._next_draw = self._draws.standard_normal(12)
 
-    def step(self, q: Array, dq: Array, *law: Any, **named: Any) -> Array:
+    def step(self, q: Array, dq: Array, *arguments: Any, **named: Any) -> Array:
         """Advance one step, as `ActuatorModel.step`.
 
         Args:
             q: (12,) rad.
             dq: (12,) rad/s.
-            law: Further arguments of `ActuatorModel.step`.
+            arguments: Further arguments of `ActuatorModel.step`.
             named: Further arguments of `ActuatorModel.step`.
 
         Returns:
             Torque (12,) N m.
         """
-        torque = self._answer(q, dq, *law, **named)
+        torque = self._answer(q, dq, *arguments, **named)
         self._next_draw = self._draws.standard_normal(12)
         return torque
 
-    def peek(self, q: Array, dq: Array, *law: Any, **named: Any) -> Array:
+    def peek(self, q: Array, dq: Array, *arguments: Any, **named: Any) -> Array:
         """Return the torque of the next step without a change of state, as `ActuatorModel.peek`.
 
         Args:
             q: (12,) rad.
             dq: (12,) rad/s.
-            law: Further arguments of `ActuatorModel.peek`.
+            arguments: Further arguments of `ActuatorModel.peek`.
             named: Further arguments of `ActuatorModel.peek`.
 
         Returns:
             Torque (12,) N m.
         """
         memory, draw, draws = self._physics.memory, self._next_draw, self._draws.bit_generator.state
-        torque = super().peek(q, dq, *law, **named)
+        torque = super().peek(q, dq, *arguments, **named)
         self._physics.memory, self._next_draw, self._draws.bit_generator.state = memory, draw, draws
         return torque
 
-    def _answer(self, q: Array, dq: Array, *law: Any, **named: Any) -> Array:
+    def _answer(self, q: Array, dq: Array, *arguments: Any, **named: Any) -> Array:
         """Return the torque of one step with the present noise."""
-        asked = super().step(q, dq, *law, **named)
+        asked = super().step(q, dq, *arguments, **named)
         torque = self._physics.torque(asked, q, dq, self.dt) + self._deviation * self._next_draw
         return np.clip(torque, -robot.TORQUE_LIMIT, robot.TORQUE_LIMIT)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from typing_extensions import override
 
 from quadvel_bringup.nodes import enclave, process_command
 from quadvel_eval.script import SCRIPTS
@@ -42,25 +43,15 @@ class ScriptedWalk(RecordedRun):
         planner = {"planner": process_command("planner", ["--ros-args", *enclave("planner"), *arguments])}
         super().__init__(recording, {**nodes, **planner}, PLANNED, lockstep, console, len(self._steps))
 
+    @override
     def listen(self, node: Any) -> None:
-        """Subscribe to the steps of the planner.
-
-        Args:
-            node: The recorder's node.
-        """
         from std_msgs.msg import String
 
         node.create_subscription(String, "planner/step", self._on_step, 10)
 
+    @override
     def is_over(self, ended: Mapping[str, int]) -> bool:
-        """Return whether the walk is complete: the planner, and no other process, ended with 0.
-
-        Args:
-            ended: Exit codes of ended processes by name.
-
-        Returns:
-            True if the run succeeded; `failure` says what makes it fail.
-        """
+        # The planner, and no other process, ended with 0.
         return dict(ended) == {"planner": 0}
 
     def _on_step(self, message: Any) -> None:

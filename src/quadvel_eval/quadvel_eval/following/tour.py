@@ -148,7 +148,7 @@ class Tour:
         commanded, velocity, command = np.zeros(3), np.zeros(3), np.zeros(3)
         share, often, tick = TICK / AVERAGING_TIME_S, round(PERIOD_S / TICK), 0
         last = self.simulator.truth().position[:2].copy()
-        left, left_at = last, self.simulator.truth().time  # where and when the robot last moved on
+        anchor, anchored_at = last, self.simulator.truth().time  # where and since when the robot has stayed
         plan: Plan | None = None
         while self.walked < self.setup.path_length:
             try:
@@ -186,9 +186,9 @@ class Tour:
                 self.walked += float(np.hypot(*(here - last)))
                 last = here.copy()
                 yield self._sample(sample, commanded, velocity, plan)
-                if np.hypot(*(here - left)) > STUCK_RADIUS_M:
-                    left, left_at = last, now
-                elif now - left_at > STUCK_TIME_S:
+                if np.hypot(*(here - anchor)) > STUCK_RADIUS_M:
+                    anchor, anchored_at = last, now
+                elif now - anchored_at > STUCK_TIME_S:
                     self.stuck = True
                     return
             tick += 1
