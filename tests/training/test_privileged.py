@@ -21,8 +21,8 @@ from quadvel_training.privileged import (  # noqa: E402
     PrivilegedRun,
 )
 from quadvel_training.randomisation import Randomisation  # noqa: E402
+from quadvel_training.scripted_trot import joint_offsets  # noqa: E402
 from quadvel_training.walking_rewards import (  # noqa: E402
-    AIRBORNE_RANGE,
     MAX_REWARD,
     MIN_REWARD,
     WalkingRewards,
@@ -122,6 +122,9 @@ def test_the_mirrored_robot_observes_the_mirror_image():
         env._qvel[ids, :6] = [0.5, (0.1, -0.1)[ids], 0.0, (0.2, -0.2)[ids], 0.3, (0.4, -0.4)[ids]]
     env._update_state()
     past.advance(env.command)
+    past.clock.phase[:] = [0.2, 0.7]  # mirrored steps come half a cycle later
+    trot = joint_offsets(env, past.clock)
+    assert trot[1] == pytest.approx(symmetry.JOINTS(trot[0]), abs=1e-4)
     one, other = privileged.observe(env, past, np.stack([joints, symmetry.JOINTS(joints)]))
     assert np.allclose(privileged.MIRROR(one), other, atol=1e-5)
 
@@ -146,7 +149,7 @@ def test_a_robot_whose_physics_blows_up_lies_fallen_and_every_number_stays_finit
     past = Past(env)
     past.advance(env.command)
     assert np.isfinite(privileged.observe(env, past, np.zeros((4, 12)))).all()
-    terms = WalkingRewards(env, WalkingWeights()).terms(env.command, past, past.air, np.zeros((3, 4, 12)))
+    terms = WalkingRewards(env, WalkingWeights()).terms(env.command, past, np.zeros((3, 4, 12)))
     assert all(np.isfinite(value).all() for value in terms.values())
     env.tick(np.tile(env.stand_q, (4, 1)))
     assert np.isfinite(env.batch.qpos).all()
@@ -199,7 +202,7 @@ def test_following_turns_pays_as_following_speeds_does():
     env.velocity[:], env.angular_velocity[:] = 0.0, 0.0
     env.velocity[2, 0] = env.angular_velocity[3, 2] = 0.8
     past.advance(command)
-    terms = rewards.terms(command, past, past.air, np.zeros((3, 4, 12)))
+    terms = rewards.terms(command, past, np.zeros((3, 4, 12)))
     total = sum(terms[name] for name in ("linear", "angular", "stride", "lasting", "steady"))
     assert total[2] > total[0] + 0.5
     assert total[3] > total[1] + 0.5
@@ -209,12 +212,13 @@ def test_feet_are_to_step_while_walking_and_to_stay_in_stance():
     env = VelocityEnv(CALM)
     rewards, past = WalkingRewards(env, WalkingWeights()), Past(env)
     command = np.array([[0.5, 0, 0, 0], [0.5, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 1]], float)
-    env.contact[:], past.down[:] = True, 5.0
-    env.contact[[1, 3], 0] = past.down[[1, 3]] = False
-    terms = rewards.terms(command, past, past.air, np.zeros((3, 4, 12)))
-    assert terms["dragging"][0] < terms["dragging"][1]
+    past.clock.phase[:] = 0.9
+    env.contact[:] = True
+    env.contact[[1, 3], 0] = False
+    terms = rewards.terms(command, past, np.zeros((3, 4, 12)))
+    assert terms["schedule"][0] < terms["schedule"][1]
     assert terms["step"][3] < terms["step"][2]
-    assert (terms["dragging"][2:] == 0.0).all()
+    assert (terms["schedule"][2:] == 0.0).all()
     assert (terms["step"][:2] == 0.0).all()
 
 
@@ -231,26 +235,20 @@ def test_a_robot_stands_once_its_four_feet_have_been_down_for_a_while():
     assert past.standing.tolist() == [True, False, True, True]
 
 
-def test_exploration_stays_wide_until_feet_lift_and_the_first_samples_are_over():
+def test_exploration_stays_within_bounds_that_fall():
     run = PrivilegedRun(SMALL)
-    with torch.no_grad():
-        run.actor.log_std.fill_(-5.0)
-    run._bound_exploration()
-    assert run.actor.log_std.detach().exp().min() == pytest.approx(SMALL.forming_std)
-    run.samples = int(SMALL.formed)
-    run._bound_exploration()
-    assert run.actor.log_std.detach().exp().min() == pytest.approx(SMALL.forming_std)
-    run._update_airborne_share(AIRBORNE_RANGE[1], 1.0)
-    with torch.no_grad():
-        run.actor.log_std.fill_(-5.0)
-    run._bound_exploration()
-    assert run.actor.log_std.detach().exp().max() < 0.2
+    for samples, most in ((0, SMALL.std), (SMALL.std_samples, SMALL.final_std)):
+        run.samples = int(samples)
+        for fill, bound in ((-5.0, 0.5 * SMALL.final_std), (5.0, most)):
+            with torch.no_grad():
+                run.actor.log_std.fill_(fill)
+            run._bound_exploration()
+            assert run.actor.log_std.detach().exp().numpy() == pytest.approx(np.full(12, bound))
 
 
 def test_a_killed_run_resumes_with_its_random_numbers(tmp_path):
     first = PrivilegedRun(SMALL)
     first.step(0.0)
-    first._update_airborne_share(0.25, 1.0)
     follow(first.grid, (1.0, 0.0, 0.0), 4)
     loop.save(first.state(), tmp_path / "privileged.pt")
     second = PrivilegedRun(SMALL)
@@ -259,7 +257,6 @@ def test_a_killed_run_resumes_with_its_random_numbers(tmp_path):
     assert first.grid.followed.any()
     assert np.array_equal(second.grid.open, first.grid.open)
     assert second.ppo.learning_rate == first.ppo.learning_rate
-    assert second.rewards.lifting == first.rewards.lifting == pytest.approx(0.5)
     second.step(0.0)
     third = PrivilegedRun(SMALL)
     third.restore(loop.load(tmp_path / "privileged.pt"))
@@ -300,14 +297,6 @@ def test_a_checkpoint_of_another_grid_is_refused_with_both_shapes():
         other.restore(state)
 
 
-def test_the_learning_rate_is_bounded_once_a_gait_has_formed():
-    run = PrivilegedRun(attrs.evolve(SMALL, formed=0.0, formed_rate=1e-5))
-    run._update_airborne_share(1.0, 1.0)
-    run.step(0.0)
-    assert run.ppo.learning_rate == 1e-5
-    assert run.ppo.actor_optimiser.param_groups[0]["lr"] == 1e-5
-
-
 def test_numbered_checkpoints_are_kept(tmp_path):
     run = PrivilegedRun(attrs.evolve(SMALL, keep=1000.0))
     keeper = NumberedCheckpoints(run, tmp_path)
@@ -325,11 +314,3 @@ def test_hips_away_from_straight_down_cost_and_less_so_sideways():
     assert hip_deviation(env, np.array([[1.0, 0.0, 0.5, 0.0], [0.0, -0.5, 0.0, 0.0]])) == pytest.approx(
         [0.6, 0.3]
     )
-
-
-def test_a_checkpoint_of_a_version_without_the_share_in_the_air_is_refused():
-    run = PrivilegedRun(SMALL)
-    state = run.state()
-    del state["airborne"]
-    with pytest.raises(loop.CheckpointError, match="airborne"):
-        run.restore(state)

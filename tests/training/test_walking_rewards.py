@@ -13,22 +13,18 @@ from quadvel_eval.gait_kind import GaitKind  # noqa: E402
 from quadvel_training import gait_log, privileged  # noqa: E402
 from quadvel_training.command_grid import CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E402
+from quadvel_training.gait_clock import duty_factor  # noqa: E402
 from quadvel_training.privileged import Past, PrivilegedConfig, PrivilegedRun  # noqa: E402
 from quadvel_training.randomisation import RATED_SPEED, RATED_STALL, Randomisation, rated_drives  # noqa: E402
 from quadvel_training.walking_rewards import (  # noqa: E402
-    AIRBORNE_RANGE,
-    FULL_PAIRING_SHARE,
     OVERSPEED_SHARE,
+    SWING_CLEARANCE_M,
     WalkingRewards,
     WalkingWeights,
-    is_one_diagonal_airborne,
-    lifting_weight,
-    synchronous_share,
 )
 
 N = 3
 CALM = EnvConfig(n=N, threads=1, period=0.02, timestep=0.004, randomisation=Randomisation.none())
-STANDING, TROT, PACE = (True,) * 4, (True, False, False, True), (True, False, True, False)  # FR, FL, RR, RL
 
 
 @pytest.fixture
@@ -41,46 +37,28 @@ def past(env):
     return Past(env)
 
 
-def terms(env, past, command=(0.5, 0.0, 0.0, 0.0), lifted=1.0):
+def terms(env, past, command=(0.5, 0.0, 0.0, 0.0)):
     rewards = WalkingRewards(env, WalkingWeights())
-    rewards.lifting = lifted
-    return rewards.terms(np.tile(command, (N, 1)).astype(float), past, past.air, np.zeros((3, N, 12)))
+    return rewards.terms(np.tile(command, (N, 1)).astype(float), past, np.zeros((3, N, 12)))
 
 
-def test_lifting_grows_with_the_share_of_the_time_in_the_air():
-    low, high = AIRBORNE_RANGE
-    assert [lifting_weight(share) for share in (0.0, low, 0.5 * (low + high), high, 0.9)] == pytest.approx(
-        [0.0, 0.0, 0.5, 1.0, 1.0]
-    )
+def test_feet_are_paid_for_being_down_and_up_as_the_clock_plans(env, past):
+    past.clock.phase[:] = 0.9  # at 0.5 m/s FR and RL swing, FL and RR stand
+    env.contact[:] = [(False, True, True, False), (True,) * 4, (True, False, False, True)]
+    weight = WalkingWeights().schedule
+    assert terms(env, past)["schedule"] == pytest.approx([weight, 0.5 * weight, 0.0])
+    assert not terms(env, past, command=(0.0, 0.0, 0.0, 1.0))["schedule"].any()
 
 
-def test_diagonal_feet_are_alike_in_a_trot_and_differ_in_a_pace():
-    contact = np.array([STANDING, TROT, PACE, (True, False, False, False)])
-    assert synchronous_share(contact) == pytest.approx([1.0, 1.0, 0.0, 0.5])
-    assert is_one_diagonal_airborne(contact).tolist() == [False, True, False, False]
-    assert not is_one_diagonal_airborne(np.zeros((1, 4), bool)).any()
-
-
-def test_diagonal_pairs_are_paid_where_one_of_them_is_in_the_air_again_and_again(env, past):
-    env.contact[:] = [STANDING, TROT, PACE]
-    past.paired[:] = [0.0, 0.5 * FULL_PAIRING_SHARE, 2 * FULL_PAIRING_SHARE]
-    weight = WalkingWeights().diagonal
-    for lifted in (0.0, 1.0):
-        assert terms(env, past, lifted=lifted)["diagonal"] == pytest.approx([0.0, 0.5 * weight, 0.0])
-    env.contact[:] = TROT
-    assert terms(env, past)["diagonal"][2] == pytest.approx(weight)
-    assert not terms(env, past, command=(0.0, 0.0, 0.0, 1.0))["diagonal"].any()
-
-
-def test_a_robot_that_trots_is_known_by_its_paired_feet_within_a_second(env, past):
-    command = np.zeros((N, 4))
-    other = tuple(not foot for foot in TROT)
-    for tick in range(50):
-        first = tick // 10 % 2 == 0
-        env.contact[:] = [STANDING, TROT if first else other, PACE]
-        past.advance(command)
-    assert past.paired == pytest.approx([0.0, 1.0 - (1.0 - 0.02 / privileged.PAIRING_S) ** 50, 0.0])
-    assert past.paired[1] > 2 * FULL_PAIRING_SHARE
+def test_clearance_is_paid_in_the_planned_swing_up_to_a_half_sine(env, past):
+    command = np.array([[0.5, 0.0, 0.0, 0.0]])
+    duty = duty_factor(command)[0]
+    past.clock.phase[:] = 0.5 * (1.0 + duty)  # FR and RL in the middle of their swing
+    env.clearance[:] = [[SWING_CLEARANCE_M] * 4, [0.5 * SWING_CLEARANCE_M] * 4, [9.0] * 4]
+    weight = WalkingWeights().lift
+    assert terms(env, past)["lift"] == pytest.approx([0.5 * weight, 0.25 * weight, 0.5 * weight])
+    past.clock.phase[:] = duty  # they lift off: no clearance is wanted yet
+    assert terms(env, past)["lift"] == pytest.approx(np.zeros(N), abs=1e-9)
 
 
 def test_stance_is_fined_at_lift_off_by_how_far_its_middle_is_from_the_hip(env, past):
@@ -124,22 +102,11 @@ def test_roll_rate_and_joints_beyond_eight_tenths_of_their_drives_speed_are_fine
     assert terms(env, past)["overspeed"] == pytest.approx([0.0, -1.5 * w.overspeed, -5 * w.overspeed])
 
 
-def test_what_fines_first_steps_waits_until_feet_lift(env, past):
-    env.velocity[:, 1], env.angular_velocity[:, 0], env.fastest[:], past.off_hip[:] = 0.3, 1.0, 20.0, 0.1
-    for name in ("off_hip", "sway", "roll", "overspeed"):
-        waiting, half, full = (terms(env, past, lifted=share)[name] for share in (0.0, 0.5, 1.0))
-        assert not waiting.any()
-        assert (full < 0.0).all()
-        assert half == pytest.approx(0.5 * full)
-
-
-def test_power_and_short_swings_weigh_five_times_as_much_at_rest_and_as_ever_from_1_m_s_on(env, past):
-    env.power[:], past.air[:], env.contact[:] = 100.0, 0.05, True
-    for speed, factor in ((0.0, 5.0), (0.5, 4.0), (1.0, 1.0), (2.0, 1.0)):
-        light, heavy = (terms(env, past, (speed, 0, 0, 0), lifted) for lifted in (0.0, 1.0))
-        for name in ("power", "swing"):
-            assert heavy[name] == pytest.approx(factor * light[name])
-            assert (light[name] < 0.0).all()
+def test_power_weighs_five_times_as_much_at_rest_and_as_ever_from_1_m_s_on(env, past):
+    env.power[:] = 100.0
+    for speed, factor in ((0.0, 5.0), (0.5, 4.0 / 1.25), (1.0, 1.0 / 1.5), (2.0, 1.0 / 2.0)):
+        weight = WalkingWeights().power
+        assert terms(env, past, (speed, 0, 0, 0))["power"] == pytest.approx([-100.0 * weight * factor] * N)
 
 
 def test_the_fastest_speed_of_a_sample_is_that_of_all_its_steps(env):

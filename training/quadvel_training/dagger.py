@@ -138,7 +138,8 @@ class Teacher:
         """
         obs = privileged.observe(self.env, self._past, self._executed[0])
         with torch.no_grad():
-            now: np.ndarray = self.actor(torch.from_numpy(obs))[0].numpy().clip(-ACTION_BOUND, ACTION_BOUND)
+            correction: np.ndarray = self.actor(torch.from_numpy(obs))[0].numpy()
+        now = privileged.total_action(self.env, self._past, correction)
         self._recent = np.concatenate([now[None], self._recent[:-1]])
         self._recent[:, self._starts] = now[self._starts]
         self._starts[:] = False

@@ -12,7 +12,7 @@ from typing_extensions import override
 from quadvel_eval.gait_kind import GaitKind
 
 from .env import EnvConfig, VelocityEnv
-from .privileged import ACTION_BOUND, ACTION_SCALE, NumberedCheckpoints, Past, PrivilegedRun, observe
+from .privileged import ACTION_SCALE, NumberedCheckpoints, Past, PrivilegedRun, observe, total_action
 from .randomisation import Randomisation, load_actuator
 from .walking_rewards import SAMPLE_S
 
@@ -81,7 +81,7 @@ def measure_gaits(run: PrivilegedRun) -> dict[float, GaitKind | None]:
     for _ in range(round(WALK_S / SAMPLE_S)):
         with torch.no_grad():
             mean = run.actor(torch.from_numpy(observe(env, past, action)))[0].numpy()
-        action = mean.clip(-ACTION_BOUND, ACTION_BOUND)
+        action = total_action(env, past, mean)
         command = env.command.copy()
         env.tick(env.stand_q + ACTION_SCALE * action)
         past.advance(command)

@@ -1,9 +1,9 @@
-"""Stage 1: a memoryless teacher that sees the true state finds a gait by rewards alone.
+"""Stage 1: a memoryless teacher that sees the true state learns to correct a scripted trot.
 
-It starts from random weights, without a reference motion. The teacher acts 50 times a second and
-learns by PPO with a mirror loss. The range of commands grows with what it follows (`command_grid`).
-What it sees of the past, errors over a stride and over seconds, a recurrent student can keep
-itself.
+It starts from random weights and learns by rewards alone. It acts 50 times a second and learns by
+PPO with a mirror loss. The range of commands grows with what it follows (`command_grid`). What it
+sees of the past, errors over a stride and over seconds and the phase of its steps, a recurrent
+student can keep itself.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from quadvel_sim.terrain import Terrain
 from . import loop, process_group
 from .command_grid import CommandGrid, GridConfig
 from .env import EnvConfig, VelocityEnv, available_cores
+from .gait_clock import SHORTEST_SWING_S, GaitClock
 from .loop import Budget
 from .networks import Gaussian, Mlp, torch_mirror
 from .ppo import Ppo, PpoConfig, Rollout, exploration_scales
 from .randomisation import Randomisation, load_actuator
+from .scripted_trot import joint_offsets
 from .walking_rewards import (
     SAMPLE_S,
     WalkingRewards,
     WalkingWeights,
     error_magnitudes,
-    is_one_diagonal_airborne,
-    lifting_weight,
 )
 
 ACTION_SCALE = 0.4  # rad per unit of the network's output
@@ -42,9 +42,7 @@ ACTION_BOUND = 4.0  # in the network's unit
 STRIDE_S = 0.35  # time constant of stride errors: about a stride
 LASTING_S = 1.5  # time constant of lasting errors
 TRANSIENT_S = 1.0  # after a new command, not part of lasting errors and scores
-PAIRING_S = 0.7  # time constant of `Past.paired`: about two strides
 HIPS_AHEAD = robot.HIP_OFFSET[0] * np.array([robot.FRONT[leg] for leg in robot.LEGS])  # m, body frame
-AIRBORNE_WEIGHT = 0.05  # weight of a rollout in the run's mean, over about 20 rollouts
 STANDING_S = 0.2  # on four feet; after that, setting off means choosing a side
 WALKING_HEIGHT_M = 0.38  # typical height of the trunk
 
@@ -63,6 +61,7 @@ MIRROR = symmetry.concatenate_mirrors(
         _signs(1),  # height
         _PLANAR,  # error over a stride
         _PLANAR,  # lasting error
+        _signs(-1, -1),  # clock
         _signs(1, -1),  # slope of the ground
         symmetry.FEET,  # friction
         _signs(1),  # payload
@@ -71,7 +70,6 @@ MIRROR = symmetry.concatenate_mirrors(
 )
 OBSERVATION_SIZE = len(MIRROR.index)
 CRITIC_EXTRA_SIZE = 4 + 4 + 1
-GAIT_EXTRA_SIZE = 2  # further inputs of this stage's critic: `Past.paired`, `lifting`
 
 
 class Past:
@@ -85,8 +83,7 @@ class Past:
             `TRANSIENT_S` after it.
         air: (n, 4), s since the foot left the ground; 0 on the ground.
         down: (n, 4), s since the foot touched the ground; 0 in the air.
-        paired: (n,), share of the time with exactly one diagonal pair in the air, low-passed over
-            `PAIRING_S`.
+        clock: plan of the steps.
         off_hip: (n, 4), m, body frame: of a foot that has just left the ground, how far ahead of
             its hip the middle of its stance was; else 0.
     """
@@ -101,7 +98,7 @@ class Past:
         self.env = env
         self.stride, self.lasting = np.zeros((n, 3)), np.zeros((n, 3))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
-        self.paired, self.off_hip = np.zeros(n), np.zeros((n, 4))
+        self.off_hip, self.clock = np.zeros((n, 4)), GaitClock(n)
         self._age = np.zeros(n)  # age of the command, s
         self._landed, self._last = np.zeros((n, 4)), np.zeros((n, 4))  # m ahead of the hip: at touchdown, now
 
@@ -111,8 +108,9 @@ class Past:
         Args:
             ids: their indices.
         """
-        for array in (self.stride, self.lasting, self.air, self.down, self.paired, self.off_hip, self._age):
+        for array in (self.stride, self.lasting, self.air, self.down, self.off_hip, self._age):
             array[ids] = 0.0
+        self.clock.reset(ids)
 
     def advance(self, command: np.ndarray) -> None:
         """Update everything after a tick of the environment.
@@ -129,10 +127,9 @@ class Past:
         self.lasting += (error - self.lasting) * settled * period / LASTING_S
         self.lasting[env.changed] = self._age[env.changed] = 0.0
         self._advance_stances()
+        self.clock.advance(command, env.contact & (self.air >= SHORTEST_SWING_S), period)
         self.air = np.where(env.contact, 0.0, self.air + period)
         self.down = np.where(env.contact, self.down + period, 0.0)
-        paired = is_one_diagonal_airborne(env.contact)
-        self.paired += (paired - self.paired) * period / PAIRING_S
 
     def _advance_stances(self) -> None:
         """Record where feet touch down and lift off; `down` is still that of the sample before."""
@@ -165,7 +162,7 @@ def velocity_error(env: VelocityEnv, command: np.ndarray) -> np.ndarray:
 def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
     """Observations of the teacher, from the true state.
 
-    They are the paper's 48 numbers, feet, height, past errors, ground and plant.
+    They are the paper's 48 numbers, feet, height, past errors, clock, ground and plant.
 
     Args:
         env: environments.
@@ -189,6 +186,7 @@ def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
             5 * (env.height[:, None] - WALKING_HEIGHT_M),
             2 * past.stride,
             2 * past.lasting,
+            past.clock.observation(env.command),
             3 * env.ground_slope,
             env.plants.drawn[:, :4],
             0.2 * env.plants.drawn[:, 4:5],
@@ -196,6 +194,21 @@ def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
         ],
         axis=1,
     ).astype(np.float32)
+
+
+def total_action(env: VelocityEnv, past: Past, correction: np.ndarray) -> np.ndarray:
+    """Add the network's correction to the scripted trot.
+
+    Args:
+        env: environments.
+        past: their past.
+        correction: (n, 12), output of the teacher's network.
+
+    Returns:
+        (n, 12), action in the network's unit, within `ACTION_BOUND`.
+    """
+    scripted = joint_offsets(env, past.clock) / ACTION_SCALE
+    return np.clip(scripted + correction, -ACTION_BOUND, ACTION_BOUND).astype(np.float32)
 
 
 def critic_extra(env: VelocityEnv, past: Past) -> np.ndarray:
@@ -226,13 +239,8 @@ class PrivilegedConfig:
             bound that falls.
         final_std: the upper bound at the end.
         std_samples: samples from `std` to `final_std`.
-        formed: samples after which a gait counts as formed if feet lift
-            (`walking_rewards.lifting_weight`).
-        forming_std: lower bound of the exploration until a gait has formed: standing robots have to
-            stumble upon steps.
         ramped: share of the commands that ramp to their velocity; the others are steps.
         reversed: share of the commands that reverse the one before.
-        formed_rate: upper bound of the learning rate once a gait has formed.
         keep: samples between numbered checkpoints.
         actuator: `eam`, `limited`, `rated`, `ideal`, or an actuator file.
         seed: seed of all draws.
@@ -248,14 +256,11 @@ class PrivilegedConfig:
     threads: int = attrs.field(factory=available_cores)
     length: int = 24
     timestep: float = 0.004
-    std: float = 0.7
+    std: float = 0.3
     final_std: float = 0.22
     std_samples: float = 2.5e7
-    formed: float = 6e6
-    forming_std: float = 0.45
     ramped: float = 0.6
     reversed: float = 0.0
-    formed_rate: float = 5e-4
     keep: float = 1e6
     actuator: str = "eam"
     seed: int = 0
@@ -361,11 +366,10 @@ class PrivilegedRun:
         self.rewards = WalkingRewards(self.env, c.rewards)
         self.scorer = CommandScorer(c.n)
         self.actor = Gaussian(Mlp(OBSERVATION_SIZE, 12), 12, c.std)
-        self.critic = Mlp(OBSERVATION_SIZE + CRITIC_EXTRA_SIZE + GAIT_EXTRA_SIZE, 1)
+        self.critic = Mlp(OBSERVATION_SIZE + CRITIC_EXTRA_SIZE, 1)
         mirrors = (torch_mirror(mirror) for mirror in (MIRROR, symmetry.JOINTS))
         self.ppo = Ppo(self.actor, self.critic, c.ppo, *mirrors)
         self.samples = 0
-        self._airborne = 0.0  # share of the time in the air of walking robots' feet
         self._spread = exploration_scales(c.n)
         self._actions = np.zeros((2, c.n, 12), np.float32)  # newest first
 
@@ -381,7 +385,6 @@ class PrivilegedRun:
             "learner": self.ppo.state(),
             "grid": self.grid.state(),
             "samples": self.samples,
-            "airborne": self._airborne,
             "random": {"learner": torch.get_rng_state(), "environments": self.env.rng.bit_generator.state},
         }
 
@@ -392,19 +395,13 @@ class PrivilegedRun:
             state: what `state` returned.
 
         Raises:
-            CheckpointError: the checkpoint has another grid, or comes from a version whose critic
-                had fewer inputs.
+            CheckpointError: the checkpoint has another grid.
         """
-        if "airborne" not in state:
-            raise loop.CheckpointError(
-                "checkpoint: found no field 'airborne', expected one of this version's stage 1"
-            )
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
         self.ppo.restore(state["learner"])
         self.grid.restore(state["grid"])
         self.samples = state["samples"]
-        self._update_airborne_share(state["airborne"], 1.0)
         process_group.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
 
@@ -420,28 +417,14 @@ class PrivilegedRun:
         rollout, seen = self.collect()
         self._bound_exploration()
         seen |= self.ppo.update(rollout)
-        if self.formed:
-            self.ppo.learning_rate = min(self.ppo.learning_rate, self.config.formed_rate)
-            loop.set_rate(self.ppo.actor_optimiser, self.ppo.learning_rate)
         return seen | self.grid.summary() | {"std": float(self.actor.log_std.detach().exp().mean())}
-
-    @property
-    def formed(self) -> bool:
-        """Whether a gait has formed: feet lift, and the first samples are over."""
-        return self.samples >= self.config.formed and self.rewards.lifting > 0.5
-
-    def _update_airborne_share(self, share: float, weight: float = AIRBORNE_WEIGHT) -> None:
-        """Low-pass the airborne share of walking robots' feet, and set `rewards.lifting`."""
-        self._airborne += weight * (share - self._airborne)
-        self.rewards.lifting = lifting_weight(self._airborne)
 
     def _bound_exploration(self) -> None:
         """Clamp the standard deviation of the exploration to its present bounds."""
         c = self.config
         most = loop.linear(c.std, c.final_std, self.samples / c.std_samples)
-        least = 0.5 * c.final_std if self.formed else c.forming_std
         with torch.no_grad():
-            self.actor.log_std.clamp_(min=float(np.log(least)), max=float(np.log(max(most, least))))
+            self.actor.log_std.clamp_(min=float(np.log(0.5 * c.final_std)), max=float(np.log(most)))
 
     def _start_over(self, ids: np.ndarray) -> None:
         """Replace robots by new ones without a past."""
@@ -454,8 +437,7 @@ class PrivilegedRun:
 
     def _critic_obs(self, obs: np.ndarray) -> np.ndarray:
         """Return the critic's observations."""
-        gait = np.stack([self.past.paired, np.full(len(obs), self.rewards.lifting)], axis=1)
-        return np.concatenate([obs, critic_extra(self.env, self.past), gait.astype(np.float32)], axis=1)
+        return np.concatenate([obs, critic_extra(self.env, self.past)], axis=1)
 
     def collect(self) -> tuple[Rollout, dict[str, float]]:
         """Collect one sequence of every environment with exploration noise.
@@ -468,20 +450,19 @@ class PrivilegedRun:
         keep: dict[str, list[np.ndarray]] = {name: [] for name in names}
         std = self.actor.log_std.exp().detach().numpy()
         terms: dict[str, float] = {}
-        seen, walking = np.zeros(6), 0
+        seen = np.zeros(5)
         for _ in range(c.length):
             obs = observe(env, self.past, self._actions[0])
             critic_obs, standing = self._critic_obs(obs), self.past.standing
             with torch.no_grad():
                 mean = self.actor(torch.from_numpy(obs))[0].numpy()
             drawn = mean + std * self._spread * env.rng.standard_normal(mean.shape, dtype=np.float32)
-            action = drawn.clip(-ACTION_BOUND, ACTION_BOUND)
+            action = total_action(env, self.past, drawn)
             command = env.command.copy()
-            touched = self.past.air.copy()
             env.tick(env.stand_q + ACTION_SCALE * action)
             self.past.advance(command)
             self.scorer.advance(velocity_error(env, command), SAMPLE_S)
-            parts = self.rewards.terms(command, self.past, touched, np.stack([action, *self._actions]))
+            parts = self.rewards.terms(command, self.past, np.stack([action, *self._actions]))
             reward = self.rewards.total(parts, env.fallen)
             self._actions = np.concatenate([action[None], self._actions[:-1]])
             fell, late = env.fallen.copy(), env.timed_out & ~env.fallen
@@ -491,15 +472,10 @@ class PrivilegedRun:
             for name, value in parts.items():
                 terms[name] = terms.get(name, 0.0) + float(value.mean()) / c.length
             errors = [size.mean() for size in error_magnitudes(self.past.stride)]
-            on_the_way = command[:, 3] < 0.5
-            walking += on_the_way.sum()
-            lifted = (~env.contact[on_the_way]).mean(axis=1).sum()
-            seen += [*errors, fell.mean(), env.broken.sum(), env.contact.mean(), lifted]
+            seen += [*errors, fell.mean(), env.broken.sum(), env.contact.mean()]
             self.scorer.finish(command, fell | late | env.changed, fell)
             self._start_over(np.flatnonzero(fell | late))
         self.scorer.report_to(self.grid)
-        airborne = float(np.mean(process_group.gather(seen[5] / max(walking, 1))))
-        self._update_airborne_share(airborne)
         self.samples += c.length * c.n * process_group.size()
         t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
         last = self._critic_obs(observe(env, self.past, self._actions[0]))
@@ -510,14 +486,13 @@ class PrivilegedRun:
             mask=torch.ones_like(t["reward"]),
             last_critic_obs=torch.from_numpy(last),
         )
-        xy, wz, falls, broken, contact, _ = seen / c.length
+        xy, wz, falls, broken, contact = seen / c.length
         return rollout, {
             "error_xy": xy,
             "error_wz": wz,
             "falls_per_minute": 60 * falls / SAMPLE_S,
             "broken": broken * c.length,
             "contact_ratio": contact,
-            "airborne": airborne,
             "reward": float(t["reward"].mean()),
         } | {f"reward/{name}": value for name, value in terms.items()}
 

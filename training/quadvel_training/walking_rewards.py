@@ -1,9 +1,7 @@
 """Rewards of the teacher: track commands in xy and yaw with a quiet trunk and a trot.
 
-There is no clock and no reference motion: the policy finds when each foot steps. Diagonal pairs
-that move together are rewarded from the start. Penalties that would prevent a robot's first clumsy
-steps (sway, roll rate, fast joints, stance off the hip, larger weights at low speed) are scaled by
-`lifting_weight`, which grows from 0 to 1 as the robots begin to lift their feet.
+A clock plans when each foot is on the ground (`gait_clock`). Where feet land and how joints move is
+left to the policy.
 """
 
 from __future__ import annotations
@@ -16,57 +14,13 @@ import numpy as np
 from quadvel_description import robot
 
 from .env import VelocityEnv
+from .gait_clock import GaitClock, foot_pace
 
 SAMPLE_S = 0.02  # how long the teacher holds an action
 MIN_REWARD, MAX_REWARD = -6.0, 4.0  # bounds of a sample's sum of terms, without falls
 TARGET_HEIGHT_M = 0.36  # of the trunk
 SWING_CLEARANCE_M = 0.06  # wanted clearance in swing
-MAX_STANCE_S = 0.4  # a foot that is down for longer while walking is dragged
 OVERSPEED_SHARE = 0.8  # of a joint's speed limit; `overspeed` penalises more
-FULL_PAIRING_SHARE = 0.3  # share of the time with one diagonal in the air that earns all of `diagonal`
-AIRBORNE_RANGE = (0.15, 0.35)  # shares of the time in the air where `lifting_weight` is 0 and 1
-DIAGONALS = ((0, 3), (1, 2))  # feet in the order of robot.LEGS: FR with RL, FL with RR
-
-
-def lifting_weight(airborne: float) -> float:
-    """Weight of the penalties that wait until feet lift.
-
-    Args:
-        airborne: share of the time that the feet of walking robots are in the air, mean of all
-            feet.
-
-    Returns:
-        0 to 1, linear over `AIRBORNE_RANGE`.
-    """
-    low, high = AIRBORNE_RANGE
-    return float(np.clip((airborne - low) / (high - low), 0.0, 1.0))
-
-
-def synchronous_share(contact: np.ndarray, pairs: tuple[tuple[int, int], ...] = DIAGONALS) -> np.ndarray:
-    """Share of the pairs of feet of which both are on the ground or both in the air.
-
-    Args:
-        contact: (n, 4) bool, feet in the order of robot.LEGS.
-        pairs: indices of the feet of each pair.
-
-    Returns:
-        (n,), from 0 to 1.
-    """
-    return np.asarray(np.mean([contact[:, one] == contact[:, other] for one, other in pairs], axis=0))
-
-
-def is_one_diagonal_airborne(contact: np.ndarray) -> np.ndarray:
-    """Whether both feet of one diagonal are in the air and both of the other on the ground.
-
-    Args:
-        contact: (n, 4) bool, feet in the order of robot.LEGS.
-
-    Returns:
-        (n,) bool.
-    """
-    (a, b), (c, d) = DIAGONALS
-    one, other = contact[:, a], contact[:, c]
-    return np.asarray((one == contact[:, b]) & (other == contact[:, d]) & (one != other))
 
 
 def error_magnitudes(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -79,18 +33,6 @@ def error_magnitudes(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         In xy (n,), m/s, and in yaw (n,), rad/s.
     """
     return np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
-
-
-def foot_pace(command: np.ndarray) -> np.ndarray:
-    """Speed at which a command moves the feet; 1 rad/s of yaw counts as 0.3 m/s.
-
-    Args:
-        command: (n, 4).
-
-    Returns:
-        (n,), m/s.
-    """
-    return np.asarray(np.hypot(command[:, 0], command[:, 1]) + 0.3 * np.abs(command[:, 2]))
 
 
 def hip_deviation(env: VelocityEnv, command: np.ndarray) -> np.ndarray:
@@ -115,10 +57,8 @@ class Past(Protocol):
 
     stride: np.ndarray
     lasting: np.ndarray
-    air: np.ndarray
-    down: np.ndarray
-    paired: np.ndarray
     off_hip: np.ndarray
+    clock: GaitClock
 
 
 @attrs.frozen
@@ -146,18 +86,15 @@ class WalkingWeights:
         acceleration: penalty of joint accelerations squared.
         rate: penalty of the change of the action squared.
         bend: penalty of the second difference of the action squared.
-        swing: at touchdown, per second in the air beyond what suits the speed, within -0.25 and 0.1
-            s.
-        dragging: penalty for each foot that stays down for `MAX_STANCE_S`.
+        schedule: reward for feet on the ground or in the air as planned, 1 for all four.
+        lift: reward for the clearance of feet in their planned swing, up to `SWING_CLEARANCE_M` in
+            the middle of it, 1 for all four.
         slip: penalty, s/m, of the speed of feet in contact.
-        diagonal: reward for diagonal pairs alike in contact, in full once a robot lifts one of them
-            regularly.
         off_hip: penalty, 1/m, at lift-off: distance of the middle of a foot's stance from the hip.
         sway: penalty of the sideways velocity relative to its mean over a stride, squared.
         roll: penalty of the roll rate squared.
         overspeed: penalty, s/rad, of joint speeds beyond `OVERSPEED_SHARE` of their limit.
-        slow: factor of `power` and `swing` at rest; falls to 1 at 1 m/s.
-        stumble: penalty, s/m^2: clearance missing in swing times the foot's speed.
+        slow: factor of `power` at rest; falls to 1 at 1 m/s.
         hips: penalty, 1/rad, of `hip_deviation`.
         posture: penalty in stance, 1/rad, of joints away from the nominal posture.
         step: penalty in stance for each foot in the air.
@@ -184,16 +121,14 @@ class WalkingWeights:
     acceleration: float = 2e-7
     rate: float = 0.012
     bend: float = 0.008
-    swing: float = 1.2
-    dragging: float = 0.4
+    schedule: float = 1.5
+    lift: float = 1.5
     slip: float = 0.06
-    diagonal: float = 0.6
     off_hip: float = 4.0
     sway: float = 10.0
     roll: float = 0.1
     overspeed: float = 0.1
     slow: float = 5.0
-    stumble: float = 3.0
     hips: float = 1.0
     posture: float = 0.2
     step: float = 0.1
@@ -209,7 +144,6 @@ class WalkingRewards:
     Attributes:
         env: environments.
         weights: weights.
-        lifting: `lifting_weight` of all robots, set by the training run.
     """
 
     def __init__(self, env: VelocityEnv, weights: WalkingWeights) -> None:
@@ -221,7 +155,6 @@ class WalkingRewards:
         """
         self.env, self.weights = env, weights
         self._dq = env.dq.copy()
-        self.lifting = 0.0
 
     def reset(self, ids: np.ndarray) -> None:
         """Clear the past of some environments.
@@ -246,15 +179,12 @@ class WalkingRewards:
         bounded = np.clip(np.sum(list(terms.values()), axis=0), MIN_REWARD, MAX_REWARD)
         return np.asarray(w.scale * (bounded - w.fall * fell))
 
-    def terms(
-        self, command: np.ndarray, past: Past, air: np.ndarray, actions: np.ndarray
-    ) -> dict[str, np.ndarray]:
+    def terms(self, command: np.ndarray, past: Past, actions: np.ndarray) -> dict[str, np.ndarray]:
         """Evaluate all weighted rewards after a sample; call it once per sample.
 
         Args:
             command: (n, 4), command in force: vx, vy (m/s), yaw rate (rad/s), 1 to stand.
             past: low-passed errors and foot timing of the robots.
-            air: (n, 4), s in the air before the sample.
             actions: (3, n, 12), of this sample and the two before.
 
         Returns:
@@ -262,7 +192,7 @@ class WalkingRewards:
         """
         walking = command[:, 3] < 0.5
         terms = self._tracking(command, past) | self._body(command, actions)
-        on_feet = self._feet(command, past, air) | self._gait(command, past)
+        on_feet = self._feet(command, past) | self._gait(command, past)
         terms |= {name: value * walking for name, value in on_feet.items()}
         terms |= {name: value * ~walking for name, value in self._stance().items()}
         return terms
@@ -309,42 +239,37 @@ class WalkingRewards:
             "alive": np.full(len(now), w.alive),
         }
 
-    def _feet(self, command: np.ndarray, past: Past, air: np.ndarray) -> dict[str, np.ndarray]:
+    def _feet(self, command: np.ndarray, past: Past) -> dict[str, np.ndarray]:
         """Rewards of swing and stance of the feet."""
         env, w = self.env, self.weights
-        pace = foot_pace(command)
-        # wanted time in the air: 0.25 s at rest, 0.16 s from 3 m/s on
-        suited = 0.25 - 0.03 * np.minimum(pace, 3.0)  # s
-        touchdown = env.contact & (air > 0.0)
         speed = np.hypot(env.foot_velocity[..., 0], env.foot_velocity[..., 1])
-        missing = np.maximum(SWING_CLEARANCE_M - env.clearance, 0.0) * np.minimum(speed, 2.0) * ~env.contact
-        swing = (np.clip(air - suited[:, None], -0.25, 0.1) * touchdown).sum(axis=1)
+        # swing share s: below 0 in the planned stance; wanted clearance: SWING_CLEARANCE_M sin(pi s)
+        share = past.clock.swing_share(command)
+        wanted = SWING_CLEARANCE_M * np.sin(np.pi * np.maximum(share, 0.0))
+        lifted = np.clip(np.minimum(env.clearance, wanted), 0.0, None) / SWING_CLEARANCE_M
         return {
-            "swing": w.swing * self._slowness(command) * swing,
-            "dragging": -w.dragging * (past.down > MAX_STANCE_S).sum(axis=1),
+            "schedule": w.schedule * (env.contact == (share < 0.0)).mean(axis=1),
+            "lift": w.lift * lifted.mean(axis=1),
             "slip": -w.slip * (np.minimum(speed, 3.0) * env.contact).sum(axis=1),
-            "stumble": -w.stumble * missing.sum(axis=1),
         }
 
     def _slowness(self, command: np.ndarray) -> np.ndarray:
-        """Factor (n,) of the rewards for slow steps: 1, and up to `slow` at rest once feet lift."""
+        """Factor (n,) of the penalty of power: `slow` at rest, 1 from 1 m/s on."""
         decay = np.maximum(1.0 - foot_pace(command) ** 2, 0.0)
-        # 1 + lifting (slow - 1) max(1 - pace^2, 0)
-        return np.asarray(1.0 + self.lifting * (self.weights.slow - 1.0) * decay)
+        # 1 + (slow - 1) max(1 - pace^2, 0)
+        return np.asarray(1.0 + (self.weights.slow - 1.0) * decay)
 
     def _gait(self, command: np.ndarray, past: Past) -> dict[str, np.ndarray]:
         """Rewards of the kind of gait."""
         env, w = self.env, self.weights
         sideways = command[:, 1] - env.velocity[:, 1] - past.stride[:, 1]
         beyond = np.maximum(env.fastest - OVERSPEED_SHARE * robot.VELOCITY_LIMIT, 0.0)
-        fines = {
-            "off_hip": w.off_hip * np.abs(past.off_hip).sum(axis=1),
-            "sway": w.sway * np.minimum(sideways**2, 0.1),
-            "roll": w.roll * np.minimum(env.angular_velocity[:, 0] ** 2, 10.0),
-            "overspeed": w.overspeed * np.minimum(beyond, 5.0).sum(axis=1),
+        return {
+            "off_hip": -w.off_hip * np.abs(past.off_hip).sum(axis=1),
+            "sway": -w.sway * np.minimum(sideways**2, 0.1),
+            "roll": -w.roll * np.minimum(env.angular_velocity[:, 0] ** 2, 10.0),
+            "overspeed": -w.overspeed * np.minimum(beyond, 5.0).sum(axis=1),
         }
-        paid = w.diagonal * np.minimum(past.paired / FULL_PAIRING_SHARE, 1.0) * synchronous_share(env.contact)
-        return {"diagonal": paid} | {name: -self.lifting * value for name, value in fines.items()}
 
     def _stance(self) -> dict[str, np.ndarray]:
         """Rewards of standing still."""

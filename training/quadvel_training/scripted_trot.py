@@ -1,0 +1,63 @@
+"""Scripted trot that the teacher's network corrects.
+
+Feet follow the gait clock: swings rise and return, stances sweep at the commanded velocity. Two
+feedbacks of the true state keep nominal robots on their feet to about 1.5 m/s on level ground.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quadvel_description import robot
+from quadvel_description.kinematics import foot_positions, inverse_kinematics
+
+from .env import VelocityEnv
+from .gait_clock import GaitClock, duty_factor, step_frequency
+
+FEET = foot_positions(robot.NOMINAL_Q)  # (4, 3), m, trunk frame
+LIFT_M = 0.08  # height of a swing
+LONGEST_STEP_M = 0.36  # way of a foot under the trunk in one stance
+LEAD_S = 0.05  # joints follow their targets so late
+PLACEMENT_S = 0.15  # feet are placed this time times the excess velocity further out (Raibert)
+MAX_EXCESS = 0.5  # m/s, excess velocity that counts
+RATE_S = 0.1  # time that a roll or pitch rate is extrapolated
+
+
+def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
+    """Return the joint targets of the scripted trot, relative to those of standing.
+
+    Args:
+        env: environments.
+        clock: gait clock of their robots.
+
+    Returns:
+        (n, 12), rad; 0 while standing.
+    """
+    command = env.command
+    vx, vy, wz, standing = command.T
+    duty, frequency = duty_factor(command), step_frequency(command)
+    phases = clock.foot_phases(ahead=LEAD_S * frequency)
+    # s: share of the planned swing that is over, below 0 in the stance
+    share = (phases - duty[:, None]) / (1.0 - duty[:, None])
+    swing, down = np.maximum(share, 0.0), share < 0.0
+    # velocity of the ground under a foot at (x, y): -(vx - wz y, vy + wz x); a stance lasts duty / f
+    under = np.stack(
+        [vx[:, None] - wz[:, None] * FEET[:, 1], vy[:, None] + wz[:, None] * FEET[:, 0]], axis=-1
+    )
+    way = under * (duty / frequency)[:, None, None]  # (n, 4, 2), m
+    way *= np.minimum(1.0, LONGEST_STEP_M / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
+    # place on the way, from 1 to -1 in stance and back in swing: 1 - 2 phase / duty, -cos(pi s)
+    along = np.where(down, 1.0 - 2.0 * phases / duty[:, None], -np.cos(np.pi * swing))
+    # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_command)
+    excess = np.clip(env.velocity[:, :2] - command[:, :2], -MAX_EXCESS, MAX_EXCESS)
+    feet = np.broadcast_to(FEET, (len(command), 4, 3)).copy()
+    feet[..., :2] += 0.5 * way * along[..., None] + PLACEMENT_S * excess[:, None, :]
+    # z_foot = z_nominal + LIFT_M sin^2(pi s); a stance foot on the lower side of the trunk pushes
+    # down: z_foot += y roll - x pitch, both extrapolated by RATE_S
+    roll, pitch = (env.roll_pitch + RATE_S * env.angular_velocity[:, :2]).T[..., None]
+    level = FEET[:, 1] * roll - FEET[:, 0] * pitch
+    feet[..., 2] += LIFT_M * np.sin(np.pi * swing) ** 2 + level * down
+    # a planned stance carries 4 / (number of planned stances) of its load on four feet
+    carried = down * 4.0 / np.maximum(down.sum(axis=1, keepdims=True), 1) - 1.0
+    load = np.repeat(carried, 3, axis=1) * (env.stand_q - robot.NOMINAL_Q)
+    return np.asarray((inverse_kinematics(feet) - robot.NOMINAL_Q + load) * (standing < 0.5)[:, None])
