@@ -256,8 +256,8 @@ class PrivilegedConfig:
     threads: int = attrs.field(factory=available_cores)
     length: int = 24
     timestep: float = 0.004
-    std: float = 0.3
-    final_std: float = 0.22
+    std: float = 0.2
+    final_std: float = 0.12
     std_samples: float = 2.5e7
     ramped: float = 0.6
     reversed: float = 0.0

@@ -18,6 +18,7 @@ FEET = foot_positions(robot.NOMINAL_Q)  # (4, 3), m, trunk frame
 LIFT_M = 0.08  # height of a swing
 LONGEST_STEP_M = 0.36  # way of a foot under the trunk in one stance
 LEAD_S = 0.05  # joints follow their targets so late
+SWEEP = 1.2  # targets sweep so much faster than the ground, as joints lag behind them
 PLACEMENT_S = 0.15  # feet are placed this time times the excess velocity further out (Raibert)
 MAX_EXCESS = 0.5  # m/s, excess velocity that counts
 RATE_S = 0.1  # time that a roll or pitch rate is extrapolated
@@ -44,7 +45,7 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
     under = np.stack(
         [vx[:, None] - wz[:, None] * FEET[:, 1], vy[:, None] + wz[:, None] * FEET[:, 0]], axis=-1
     )
-    way = under * (duty / frequency)[:, None, None]  # (n, 4, 2), m
+    way = SWEEP * under * (duty / frequency)[:, None, None]  # (n, 4, 2), m
     way *= np.minimum(1.0, LONGEST_STEP_M / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
     # place on the way, from 1 to -1 in stance and back in swing: 1 - 2 phase / duty, -cos(pi s)
     along = np.where(down, 1.0 - 2.0 * phases / duty[:, None], -np.cos(np.pi * swing))
