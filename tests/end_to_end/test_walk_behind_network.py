@@ -5,8 +5,7 @@ Link, packets, network and clocks are the real ones; only sockets are not, so th
 
 from __future__ import annotations
 
-import socket
-from collections import deque
+from collections import Counter, deque
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,9 @@ import pytest
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver import wire
-from quadvel_driver.link import NO_CALIBRATION, LinkConfig, UdpLink
-from quadvel_driver.wire import BoardState
+from quadvel_driver.aliengo import ALIENGO
+from quadvel_driver.board_state import BoardState
+from quadvel_driver.link import Link, LinkConfig, Transport
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_eval.robot_loop import RobotLoop
 from quadvel_policy.policy_file import PolicyFile
@@ -29,25 +29,25 @@ TURNS = 4  # of the link, a millisecond
 SETTLE, MEASURE = 400, 800  # ticks of 5 ms
 
 
-class Wire(socket.socket):
+class Wire(Transport):
     """The link's end of the network."""
 
     def __init__(self) -> None:
-        super().__init__(socket.AF_INET, socket.SOCK_DGRAM)
+        self.board, self.counts = "board", Counter()
         self.sent: deque[bytes] = deque()
         self.came: deque[bytes] = deque()
 
-    def send(self, data: Any, flags: int = 0) -> int:
-        self.sent.append(data)
-        return len(data)
+    def send(self, packet: bytes) -> None:
+        self.sent.append(packet)
 
-    def recvfrom(self, size: int, flags: int = 0) -> tuple[bytes, tuple[str, int]]:
-        if not self.came:
-            raise BlockingIOError
-        return self.came.popleft(), self.getpeername()
+    def receive(self) -> bytes | None:
+        return self.came.popleft() if self.came else None
 
-    def getpeername(self) -> tuple[str, int]:
-        return "board", 8007
+    def wait(self, timeout: float) -> None:
+        raise AssertionError("time is simulated")
+
+    def close(self) -> None:
+        pass
 
 
 class BehindNetwork:
@@ -60,7 +60,7 @@ class BehindNetwork:
         self._wire = Wire()
         self._newest: RobotState | None = None
         self.time = 50.0
-        self.link = UdpLink(LinkConfig(), self._on_state, NO_CALIBRATION, self._wire, clock=lambda: self.time)
+        self.link = Link(ALIENGO, wire, self._wire, LinkConfig(), self._on_state, clock=lambda: self.time)
         self._warming_up = True
         self.step(300)  # the link finds out in what unit the board counts
         self._warming_up = False

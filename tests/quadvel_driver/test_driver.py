@@ -32,8 +32,8 @@ from quadvel_bringup.nodes import process_command as node_command  # noqa: E402
 from quadvel_description.robot import NOMINAL_Q  # noqa: E402
 from quadvel_description.state import JointCommand  # noqa: E402
 from quadvel_driver import wire  # noqa: E402
+from quadvel_driver.board_state import Button, Remote  # noqa: E402
 from quadvel_driver.remote import BUTTONS, OperatorCommand  # noqa: E402
-from quadvel_driver.wire import Button, Remote  # noqa: E402
 from quadvel_msgs.msg import LowCmd, LowState  # noqa: E402
 from quadvel_msgs.srv import SetMode  # noqa: E402
 from quadvel_nodes.messages import write_low_cmd  # noqa: E402
@@ -358,7 +358,7 @@ quadvel_dds.install()
 from quadvel_driver import driver, link
 def die(self):
     raise OSError("the network card is gone")
-link.UdpLink.run = die
+link.Link.run = die
 driver.main()
 """
 

@@ -24,6 +24,9 @@ import numpy as np
 
 from quadvel_description.state import JointCommand, RobotState
 
+from .board_state import BoardState, Button, Remote
+from .packets import WireError
+
 RAW, CHANGED, VALID_CRC = range(3)
 HEADER_BYTES = 2  # bytes that select the kind of datagram and the packet
 CHANGE_BYTES = 3  # bytes per change: two for the position, one for the value
@@ -60,7 +63,7 @@ def reference_crc(data: bytes) -> int:
     return value
 
 
-def _state(wire: Any) -> Any:
+def _state() -> BoardState:
     """Return the board state of a standing robot."""
     robot = RobotState(
         *(
@@ -74,7 +77,7 @@ def _state(wire: Any) -> Any:
         *(np.zeros(3), np.array([0.0, 0.0, 9.81]), np.full(4, 60.0)),
     )
     twelve = np.full(12, 10)
-    return wire.BoardState(robot, twelve, 0 * twelve, 3 * twelve, 40, wire.Remote(wire.Button.L1, lx=0.5))
+    return BoardState(robot, twelve, 0 * twelve, 3 * twelve, 40, Remote(Button.L1, lx=0.5))
 
 
 class FuzzTarget:
@@ -87,7 +90,7 @@ class FuzzTarget:
     def __init__(self, wire: Any) -> None:
         self._wire = wire
         command = JointCommand(q=np.ones(12), kp=np.full(12, 30.0), kd=np.ones(12))
-        self._packets = wire.encode_command(command), wire.encode_state(_state(wire))
+        self._packets = wire.encode_command(command), wire.encode_state(_state())
         self._decoders = wire.decode_command, wire.decode_state
         self.counts: Counter[str] = Counter()
 
@@ -125,7 +128,7 @@ class FuzzTarget:
         for decode in self._decoders:
             try:
                 record = decode(data)
-            except self._wire.WireError:
+            except WireError:
                 self.counts["refused"] += 1
                 continue
             self.counts["accepted"] += 1

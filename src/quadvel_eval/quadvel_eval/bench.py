@@ -25,6 +25,7 @@ from quadvel_description.onnx_format import float_value, message, serialise
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
+from quadvel_driver.board_state import BoardState
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_nodes.number_text import number_text
 from quadvel_policy.policy_file import PolicyFile
@@ -209,7 +210,7 @@ def bench_packets() -> dict[str, Any]:
         Medians, us.
     """
     twelve = np.full(12, 10)
-    state = wire.BoardState(make_simulator(Setup(), seed=0).state(), twelve, twelve, twelve)
+    state = BoardState(make_simulator(Setup(), seed=0).state(), twelve, twelve, twelve)
     command = JointCommand(q=NOMINAL_Q.copy(), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
     of_state, of_command = wire.encode_state(state), wire.encode_command(command)
     jobs: dict[str, Callable[[], object]] = {

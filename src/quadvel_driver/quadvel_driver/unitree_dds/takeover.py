@@ -1,0 +1,183 @@
+"""Takeover of the joints from the robot's own controller, without a fight. No ROS.
+
+nothing is sent      the battery is charged, the motion switcher has released the robot's own
+controller, nobody writes rt/lowcmd for QUIET_S
+->  full         the switcher is asked again every ASK_PERIOD_S
+->  brake only   another program wrote rt/lowcmd or has a writer of it, or the robot's own
+controller is back
+->  nothing      after BRAKE_S, until the driver is started again: two writers of
+rt/lowcmd would fight over the joints
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+from typing_extensions import override
+
+from quadvel_driver.board_state import BoardState
+from quadvel_driver.takeover import Access, Takeover
+
+from .bus import RemoteWriter
+from .motion_switcher import Answer, Api
+from .wire import MOTOR_OFF
+
+ASK_PERIOD_S = 0.5  # between two requests to the motion switcher
+ANSWER_TIMEOUT_S = 3.0  # without an answer: a robot without motion switcher
+RELEASE_TIMEOUT_S = 10.0  # without a release, after which the operator is told
+QUIET_S = 1.0  # without commands or writers of others, before the joints are taken
+BRAKE_S = 0.5  # time of braking after the joints are lost
+OBEY_TIMEOUT_S = 1.0  # of commands that motors do not follow
+
+
+class Switcher(Protocol):
+    """See `MotionSwitcher`."""
+
+    def ask(self, api: Api) -> None:
+        """Send a request."""
+
+    def answers(self) -> list[Answer]:
+        """Take the answers to own requests."""
+
+
+class Commands(Protocol):
+    """See `DdsTransport`."""
+
+    def claim(self) -> None:
+        """Create the writer of commands."""
+
+    def foreign_commands(self) -> int:
+        """Count the commands of other programs since the last call."""
+
+    def foreign_writers(self) -> Sequence[RemoteWriter]:
+        """List other programs' writers of commands."""
+
+
+class DdsTakeover(Takeover):
+    """Takes the joints once, keeps watching, and lets go if anyone else commands them."""
+
+    def __init__(self, commands: Commands, switcher: Switcher, min_battery: int) -> None:
+        """Create a takeover that may not send anything yet.
+
+        Args:
+            commands: Topic of the commands.
+            switcher: The robot's motion switcher.
+            min_battery: Least state of charge, %.
+        """
+        super().__init__()
+        self.access = Access.NONE
+        self._commands, self._switcher = commands, switcher
+        self._min_battery = min_battery
+        self._mode: str | None = None  # the robot's own controller, "" for none, None while unknown
+        self._codes: dict[int, int] = {}  # of the last answer to each request, 0 for success
+        self._asked_at = self._answered_at = -math.inf
+        self._asking_since: float | None = None
+        self._held_back_at = -math.inf  # when another controller or writer was seen last
+        self._obeyed_at = -math.inf
+        self._lost_at: float | None = None
+
+    @override
+    def update(self, now: float, newest: BoardState | None) -> None:
+        foreign = self._foreign_problem()
+        if self.access is Access.FULL:
+            self._ask_for_mode(now)
+            self._keep(now, newest, foreign)
+        elif self._lost_at is not None:
+            if now - self._lost_at > BRAKE_S:
+                self.access = Access.NONE
+        else:
+            self._take(now, newest, foreign)
+
+    def _take(self, now: float, newest: BoardState | None, foreign: str) -> None:
+        """Take the joints if nothing speaks against it."""
+        self.problem = self._state_problem(newest)
+        if self.problem:  # the robot's own controller keeps the legs
+            return
+        self._ask_for_mode(now)
+        self.problem = self._mode_problem(now) or foreign
+        if self.problem:
+            self._held_back_at = now
+        elif now - self._held_back_at < QUIET_S:
+            self.problem = "waiting until nobody else commands the joints"
+        else:
+            self._commands.claim()
+            self._obeyed_at = now
+            self.access = Access.FULL
+
+    def _keep(self, now: float, newest: BoardState | None, foreign: str) -> None:
+        """Let go if anyone else commands the joints; else say what the operator should know."""
+        lost = foreign
+        if self._mode:
+            lost = f"the robot's own controller '{self._mode}' is back"
+        if lost:
+            self._lost_at, self.access = now, Access.BRAKE
+            self.problem = f"{lost}: the joints were braked and let go; end it and start the driver again"
+            return
+        if newest is not None and (newest.motor_mode != MOTOR_OFF).any():
+            self._obeyed_at = now
+        self.problem = ""
+        if now - self._obeyed_at > OBEY_TIMEOUT_S:
+            self.problem = f"the motors stay off (mode {MOTOR_OFF}) though rt/lowcmd is sent: only the EDU model obeys it"
+        elif now - self._answered_at > ANSWER_TIMEOUT_S:
+            self.problem = (
+                f"the motion switcher has not answered for {ANSWER_TIMEOUT_S:g} s: "
+                "whether the robot's own controller is back is not known"
+            )
+
+    def _state_problem(self, newest: BoardState | None) -> str:
+        if newest is None or newest.battery is None:
+            return "the robot's battery is not known yet"
+        if newest.battery.charge < self._min_battery:
+            return (
+                f"the battery is at {newest.battery.charge} %, expected at least {self._min_battery} %: "
+                "the joints are not taken over"
+            )
+        return ""
+
+    def _foreign_problem(self) -> str:
+        count, writers = self._commands.foreign_commands(), self._commands.foreign_writers()
+        if count:
+            return f"another program commands the joints ({count} samples on rt/lowcmd)"
+        if writers:
+            return f"another program may command the joints ({len(writers)} silent writers of rt/lowcmd)"
+        return ""
+
+    def _ask_for_mode(self, now: float) -> None:
+        """Take the answers; ask again, and release a controller that holds the legs before they are taken."""
+        for answer in self._switcher.answers():
+            self._codes[answer.api] = answer.code
+            self._answered_at = now
+            if answer.api == Api.CHECK_MODE:
+                self._mode = answer.mode
+        if now - self._asked_at < ASK_PERIOD_S:
+            return
+        self._asked_at = now
+        if self._asking_since is None:
+            self._asking_since = now
+        if self._mode and self.access is Access.NONE:
+            self._switcher.ask(Api.RELEASE_MODE)
+        self._switcher.ask(Api.CHECK_MODE)
+
+    def _mode_problem(self, now: float) -> str:
+        """Return why the robot's own controller is not known to have let go, or "" if it has."""
+        assert self._asking_since is not None
+        since = now - self._asking_since
+        for api, code in self._codes.items():
+            if code:
+                return (
+                    f"the motion switcher answers request {api} with error {code}: "
+                    "this firmware does not release the legs"
+                )
+        if self._mode is None or now - self._answered_at > ANSWER_TIMEOUT_S:
+            if since < ANSWER_TIMEOUT_S:
+                return "asking the robot for its mode"
+            return (
+                f"the motion switcher has not answered for {ANSWER_TIMEOUT_S:g} s: "
+                "firmware before 1.0.24 has none and cannot release the legs"
+            )
+        if self._mode:
+            stubborn = f", and has not let go for {since:.0f} s" if since > RELEASE_TIMEOUT_S else ""
+            return f"the robot's own controller '{self._mode}' holds the legs{stubborn}"
+        return ""
