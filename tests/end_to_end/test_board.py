@@ -28,8 +28,8 @@ from rclpy.node import Node  # noqa: E402
 from sensor_msgs.msg import Joy  # noqa: E402
 
 from quadvel_bringup.stack import PARAMETERS  # noqa: E402
+from quadvel_driver.board_state import Button  # noqa: E402
 from quadvel_driver.remote import BUTTONS, OperatorCommand  # noqa: E402
-from quadvel_driver.wire import Button  # noqa: E402
 from quadvel_msgs.msg import ControllerState  # noqa: E402
 
 pytestmark = pytest.mark.realtime

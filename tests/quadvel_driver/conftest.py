@@ -14,8 +14,10 @@ import pytest
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver import wire
-from quadvel_driver.link import LinkConfig, UdpLink
-from quadvel_driver.wire import BoardState, Remote
+from quadvel_driver.aliengo import ALIENGO
+from quadvel_driver.board_state import BoardState, Remote
+from quadvel_driver.link import Link
+from quadvel_driver.udp import UdpConfig, UdpTransport
 
 NO_REMOTE = Remote()
 
@@ -102,12 +104,13 @@ def board() -> Iterator[TestBoard]:
 class Linked:
     """A link that runs in a thread, and the states that it handed on."""
 
-    def __init__(self, config: LinkConfig) -> None:
+    def __init__(self, config: UdpConfig) -> None:
         self.states: list[BoardState] = []
-        self.link = UdpLink(config, self.states.append)
+        self.transport = UdpTransport(config)
+        self.link = Link(ALIENGO, wire, self.transport, config, self.states.append)
         self._thread = threading.Thread(target=self.link.run)
 
-    def start(self) -> UdpLink:
+    def start(self) -> Link:
         self._thread.start()
         return self.link
 
@@ -132,7 +135,7 @@ def connect(board: TestBoard) -> Iterator[Callable[..., Linked]]:
 
     def make(**changes: object) -> Linked:
         values = {"board_address": "127.0.0.1", "board_port": board.port, "local_port": 0}
-        made.append(Linked(LinkConfig(**{**values, **changes})))
+        made.append(Linked(UdpConfig(**{**values, **changes})))
         return made[-1]
 
     yield make

@@ -32,8 +32,8 @@ from quadvel_bringup.nodes import process_command as node_command  # noqa: E402
 from quadvel_description.robot import NOMINAL_Q  # noqa: E402
 from quadvel_description.state import JointCommand  # noqa: E402
 from quadvel_driver import wire  # noqa: E402
+from quadvel_driver.board_state import Button, Remote  # noqa: E402
 from quadvel_driver.remote import BUTTONS, OperatorCommand  # noqa: E402
-from quadvel_driver.wire import Button, Remote  # noqa: E402
 from quadvel_msgs.msg import LowCmd, LowState  # noqa: E402
 from quadvel_msgs.srv import SetMode  # noqa: E402
 from quadvel_nodes.messages import write_low_cmd  # noqa: E402
@@ -337,6 +337,7 @@ def test_ctrl_c_ends_it_cleanly_and_leaves_the_joints_damped(
     [
         ({"board_address": "300.1.1.1"}, "no link from any address:0 to 300.1.1.1:"),
         ({"interface": "nosuch0"}, "no link from any address:0 on nosuch0 to 127.0.0.1:"),
+        ({"robot": "go2", "interface": "nosuch0"}, "no link to DDS domain 0 on nosuch0: "),
         ({"calibration": "/nowhere.yaml"}, "cannot read /nowhere.yaml: No such file"),
         ({"state_rate": 2000}, "state_rate: found 2000, expected a whole number, 50 to 1000"),
         ({"command_timeout": 2.0}, "command_timeout: found 2.0, expected above 0 and at most 0.5"),
@@ -358,7 +359,7 @@ quadvel_dds.install()
 from quadvel_driver import driver, link
 def die(self):
     raise OSError("the network card is gone")
-link.UdpLink.run = die
+link.Link.run = die
 driver.main()
 """
 

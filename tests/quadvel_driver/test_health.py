@@ -5,9 +5,10 @@ from __future__ import annotations
 import attrs
 import pytest
 
+from quadvel_driver.aliengo import ALIENGO
+from quadvel_driver.board_state import Battery, BoardState
 from quadvel_driver.health import Health, Level, diagnostic_values
 from quadvel_driver.link import COUNTER_NAMES, LinkReport
-from quadvel_driver.wire import BoardState
 
 from .conftest import standing
 
@@ -29,7 +30,7 @@ def judged(
     stopped: bool = False, newest: BoardState | None = None, counts: dict | None = None, **changes: object
 ):
     changed = attrs.evolve(WELL, counts={**WELL.counts, **(counts or {})}, **changes)
-    return Health("192.168.123.10:8007").assess(changed, newest or standing(1), stopped)
+    return Health("192.168.123.10:8007", ALIENGO).assess(changed, newest or standing(1), stopped)
 
 
 def test_all_is_well_where_commands_are_followed_and_where_none_come() -> None:
@@ -72,6 +73,7 @@ def test_all_is_well_where_commands_are_followed_and_where_none_come() -> None:
             "3 datagrams dropped in the last second, the last: state: CRC is",
         ),
         ({"counts": {"command_timeouts": 1}}, Level.WARN, "low_cmd stopped: the joints were damped"),
+        ({"takeover": "another program"}, Level.ERROR, "another program"),
         ({"stopped": True}, Level.WARN, "stopped by the remote; R1 + L1 + START release it"),
     ],
 )
@@ -91,9 +93,16 @@ def test_a_motor_that_dropped_out_is_named_before_anything_less() -> None:
     assert sentence.startswith("RR_thigh_joint has dropped out (mode 8, error 4): stop the robot")
 
 
+def test_a_battery_that_is_low_is_named_and_each_is_reported() -> None:
+    assert judged(newest=attrs.evolve(standing(1), battery=Battery(15, 26.0, -3.0)))[0] == Level.OK
+    low = attrs.evolve(standing(1), battery=Battery(14, 26.0, -3.0))
+    assert judged(newest=low) == (Level.WARN, "the battery is at 14 %: lie down and charge it")
+    assert diagnostic_values(WELL, low, ALIENGO)["battery"] == "14 %, 26.0 V, -3.0 A"
+
+
 def test_only_what_is_new_since_the_last_report_counts() -> None:
     health, report = (
-        Health("board"),
+        Health("board", ALIENGO),
         attrs.evolve(WELL, counts={**WELL.counts, "wrong_crc": 2}, last_refusal="CRC"),
     )
     assert health.assess(report, standing(1), False)[0] == Level.WARN
@@ -101,9 +110,9 @@ def test_only_what_is_new_since_the_last_report_counts() -> None:
 
 
 def test_the_figures_hold_counts_temperatures_and_modes() -> None:
-    values = diagnostic_values(WELL, standing(1))
+    values = diagnostic_values(WELL, standing(1), ALIENGO)
     assert values["states"] == 100
     assert values["FL_hip_joint temperature"] == 35
     assert values["FL_hip_joint mode"] == 10
     assert values["imu temperature"] == 40
-    assert "FL_hip_joint mode" not in diagnostic_values(WELL, None)
+    assert "FL_hip_joint mode" not in diagnostic_values(WELL, None, ALIENGO)

@@ -12,7 +12,9 @@ import pytest
 from quadvel_description.robot import COMMAND_UPPER, NOMINAL_Q, TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_description.state import MODE_SERVO, JointCommand
 from quadvel_driver import wire
-from quadvel_driver.link import SHUTDOWN_PACKETS, LinkConfig, LinkError, UdpLink, clamp_for_board
+from quadvel_driver.aliengo import ALIENGO
+from quadvel_driver.link import SHUTDOWN_PACKETS, LinkError, clamp_for_board
+from quadvel_driver.udp import UdpConfig, UdpTransport
 
 from .conftest import TestBoard, standing
 
@@ -104,7 +106,7 @@ def test_of_states_that_wait_the_newest_wins(board: TestBoard, connect: Connect)
     again = connect()
     again.link._board_clock = link._board_clock
     again.link.brake()  # lets the board know it
-    board.hear_until(lambda command: board.client[1] == again.link.local_port)
+    board.hear_until(lambda command: board.client[1] == again.transport.local_port)
     for tick in (after, after + 1, after + 4, after + 3, after + 4):
         board.send(wire.encode_state(standing(tick)))
     again.start()
@@ -155,13 +157,15 @@ def test_a_state_of_nothing_but_zeros_is_refused(board: TestBoard, connect: Conn
 
 def test_nobody_but_the_board_is_heard(board: TestBoard, connect: Connect) -> None:
     linked = connect()
-    link = linked.start()
+    linked.start()
     board.report()
     linked.wait_for(lambda: linked.states)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.bind(("127.0.0.1", 0))
         for i in range(50):
-            stranger.sendto(wire.encode_state(standing(2_000_000 + i)), ("127.0.0.1", link.local_port))
+            stranger.sendto(
+                wire.encode_state(standing(2_000_000 + i)), ("127.0.0.1", linked.transport.local_port)
+            )
     board.report(50, first=9000)
     linked.wait_for(lambda: linked.states[-1].robot.tick >= 9000)
     assert max(state.robot.tick for state in linked.states) < 100_000
@@ -220,19 +224,19 @@ def test_a_board_that_is_not_there_is_told_and_found_once_it_is(connect: Connect
 
 
 def test_a_port_that_is_taken_is_told_in_one_sentence(board: TestBoard) -> None:
-    config = LinkConfig(board_address="127.0.0.1", local_address="127.0.0.1", local_port=board.port)
+    config = UdpConfig(board_address="127.0.0.1", local_address="127.0.0.1", local_port=board.port)
     with pytest.raises(LinkError, match=rf"no link from 127.0.0.1:{board.port} to 127.0.0.1:8007: .*in use"):
-        UdpLink(config, print)
+        UdpTransport(config)
 
 
 def test_an_address_that_is_none_is_told_in_one_sentence() -> None:
     with pytest.raises(LinkError, match=r"no link from any address:0 to 300\.1\.1\.1:8007: "):
-        UdpLink(LinkConfig(board_address="300.1.1.1", local_port=0), print)
+        UdpTransport(UdpConfig(board_address="300.1.1.1", local_port=0))
 
 
 def test_nothing_beyond_the_robots_limits_is_sent() -> None:
     wild = JointCommand(*(np.full(12, 1e6) for _ in range(3)), kp=np.full(12, 50.0), kd=np.ones(12))
-    sent = clamp_for_board(wild)
+    sent = clamp_for_board(wild, ALIENGO)
     np.testing.assert_array_equal(sent.q, COMMAND_UPPER)
     np.testing.assert_array_equal(sent.dq, VELOCITY_LIMIT)
     np.testing.assert_array_equal(sent.tau, TORQUE_LIMIT)

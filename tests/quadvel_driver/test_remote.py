@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quadvel_driver.board_state import Button, Remote
 from quadvel_driver.remote import BUTTONS, ZERO_VELOCITY_S, OperatorCommand, RemoteConfig, RemotePilot
-from quadvel_driver.wire import Button, Remote
 
 CONFIG = RemoteConfig(stick_dead_zone=0.1, stick_velocity=(1.0, 0.5, 2.0))
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_driver import wire
-from quadvel_driver.wire import BoardState, Button, Remote, WireError
+from quadvel_driver.board_state import BoardState, Button, Remote
+from quadvel_driver.packets import WireError
 
 # The formats, written down a second time: struct instead of NumPy, as the fact sheet gives them.
 MOTOR_COMMAND = "BffhhhIII"

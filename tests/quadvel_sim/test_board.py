@@ -15,13 +15,16 @@ from quadvel_description.kinematics import roll_pitch
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
+from quadvel_driver.aliengo import ALIENGO
+from quadvel_driver.board_state import BoardState
 from quadvel_driver.calibration import Calibration
-from quadvel_driver.link import NO_CALIBRATION, LinkConfig, UdpLink
-from quadvel_driver.wire import BoardState
+from quadvel_driver.link import NO_CALIBRATION, Link
+from quadvel_driver.udp import UdpConfig, UdpTransport
 from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.board import Board, BoardError
 from quadvel_sim.loop import SimulationLoop
 from quadvel_sim.simulator import Simulator
+from quadvel_sim.udp_board import UdpBoard
 
 Wait = Callable[[Callable[[], object]], None]
 
@@ -39,7 +42,7 @@ def serve() -> Iterator[Callable[..., Board]]:
     ends: list[Callable[[], None]] = []
 
     def begin(off: Calibration = NO_CALIBRATION, **network: float) -> Board:
-        board = Board(("127.0.0.1", 0), NetworkConfig(**network), off)
+        board = UdpBoard(("127.0.0.1", 0), NetworkConfig(**network), off)
         simulator = Simulator()
         simulator.reset("stand")
         board.loop = SimulationLoop(simulator, board.publish, period=2, answer_timeout=0.0)
@@ -55,21 +58,21 @@ def serve() -> Iterator[Callable[..., Board]]:
 
 
 @pytest.fixture
-def link() -> Iterator[Callable[[Board], tuple[UdpLink, list[BoardState]]]]:
+def link() -> Iterator[Callable[[Board], tuple[Link, list[BoardState]]]]:
     """Connects the driver's link to a board; it holds the robot up."""
     ends: list[Callable[[], None]] = []
 
-    def begin(board: Board, calibration: Calibration = NO_CALIBRATION) -> tuple[UdpLink, list[BoardState]]:
+    def begin(board: Board, calibration: Calibration = NO_CALIBRATION) -> tuple[Link, list[BoardState]]:
         states: list[BoardState] = []
         host, port = board.address
-        config = LinkConfig(board_address=host, board_port=port, local_port=0, command_timeout=0.5)
+        config = UdpConfig(board_address=host, board_port=port, local_port=0, command_timeout=0.5)
 
         def hold(state: BoardState) -> None:
             states.append(state)
             gains = {"kp": np.full(12, 150.0), "kd": np.full(12, 4.0)}
             made.submit(JointCommand(q=np.array(NOMINAL_Q), tick=state.robot.tick, **gains))
 
-        made = UdpLink(config, hold, calibration)
+        made = Link(ALIENGO, wire, UdpTransport(config), config, hold, calibration)
         thread = threading.Thread(target=made.run)
         thread.start()
         ends.extend((made.stop, thread.join))
@@ -81,10 +84,10 @@ def link() -> Iterator[Callable[[Board], tuple[UdpLink, list[BoardState]]]]:
 
 
 Serve = Callable[..., Board]
-Link = Callable[..., Any]
+Connect = Callable[..., Any]
 
 
-def test_the_real_link_holds_the_simulated_robot_up(serve: Serve, link: Link) -> None:
+def test_the_real_link_holds_the_simulated_robot_up(serve: Serve, link: Connect) -> None:
     board = serve()
     _, states = link(board)
     wait_for(lambda: len(states) > 300, board)
@@ -96,7 +99,7 @@ def test_the_real_link_holds_the_simulated_robot_up(serve: Serve, link: Link) ->
     assert board.counts["commands"] > 0
 
 
-def test_a_robot_whose_sensors_are_off_is_set_right_by_its_calibration(serve: Serve, link: Link) -> None:
+def test_a_robot_whose_sensors_are_off_is_set_right_by_its_calibration(serve: Serve, link: Connect) -> None:
     off = Calibration(joint_zeros=np.tile([0.1, -0.1, 0.15], 4), imu_mounting=np.array([0.03, -0.02]))
     board = serve(off)
     _, states = link(board, off)
@@ -107,7 +110,7 @@ def test_a_robot_whose_sensors_are_off_is_set_right_by_its_calibration(serve: Se
     assert np.abs(roll_pitch(robot.quaternion) - roll_pitch(truth.data.qpos[3:7])).max() < 0.01
 
 
-def test_a_network_that_does_everything_wrong_does_not_let_it_fall(serve: Serve, link: Link) -> None:
+def test_a_network_that_does_everything_wrong_does_not_let_it_fall(serve: Serve, link: Connect) -> None:
     board = serve(
         network_loss=0.1,
         network_jitter=0.002,
@@ -217,4 +220,4 @@ def test_what_is_no_command_is_counted_and_moves_nothing(serve: Serve, datagram:
 def test_a_port_that_is_taken_is_told_in_one_sentence(serve: Serve) -> None:
     host, port = serve().address
     with pytest.raises(BoardError, match=rf"the board can't listen on {host}:{port}: .*in use"):
-        Board((host, port), NetworkConfig())
+        UdpBoard((host, port), NetworkConfig())

@@ -72,17 +72,33 @@ def domain_configuration() -> str:
 
 @cache
 def _join(domain_id: int) -> Domain:
-    """Join a domain.
+    """Join a domain as the ROS environment variables say.
 
-    Without a CYCLONEDDS_URI the sockets, which Cyclone binds to all interfaces, are bound to the
-    loopback interface.
+    Without a CYCLONEDDS_URI the sockets are bound to the loopback interface.
     """
-    settings, before = domain_configuration(), _sockets()
+    settings = domain_configuration()
+    alone = LOOPBACK in settings and not os.environ.get("CYCLONEDDS_URI")
+    return open_domain(domain_id, settings, "lo" if alone else "")
+
+
+def open_domain(domain_id: int, settings: str, device: str) -> Domain:
+    """Open a domain in this process.
+
+    Args:
+        domain_id: Number of the domain in this process.
+        settings: Configuration for Cyclone DDS.
+        device: Network interface to which to bind the sockets, which Cyclone binds to all; empty:
+            none.
+
+    Returns:
+        The domain.
+    """
+    before = _sockets()
     domain = Domain(domain_id, settings)
-    if LOOPBACK in settings and not os.environ.get("CYCLONEDDS_URI"):
+    if device:
         for name in _sockets().keys() - before.keys():
             with socket.socket(fileno=os.dup(_sockets()[name])) as one:
-                one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, device.encode())
     return domain
 
 
@@ -109,13 +125,14 @@ class Participant:
         gid: Its identity on the wire.
     """
 
-    def __init__(self, domain_id: int) -> None:
+    def __init__(self, domain_id: int, domain: Domain | None = None) -> None:
         """Join a domain.
 
         Args:
             domain_id: Number of the domain, 0 to 232.
+            domain: The domain if `open_domain` has opened it; None: join it as ROS does.
         """
-        _join(domain_id)
+        self._domain = domain or _join(domain_id)
         self.dds = DomainParticipant(domain_id, qos=Qos(Policy.Userdata(b"enclave=/;")))
         self.gid = self.dds.guid.bytes
         self._topics: dict[tuple[str, str], Topic[Any]] = {}

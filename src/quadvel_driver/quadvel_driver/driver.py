@@ -1,6 +1,6 @@
 """The node `driver`: connects the real robot to the topics of the controller.
 
-A `UdpLink` runs in its own thread and calls back with each state; commands arrive in the executor's
+A `Link` runs in its own thread and calls back with each state; commands arrive in the executor's
 thread. Commands of the operator's remote become cmd_vel_teleop, command_lock and calls of the
 controller's services.
 """
@@ -30,13 +30,15 @@ from quadvel_nodes.node import read_parameters, request_exit, run
 from quadvel_nodes.robot_view import RobotView
 from quadvel_nodes.system_time import SystemTime
 
+from .board_state import BoardState
 from .decimator import Decimator
+from .driven_robot import DrivenRobot
 from .dry_run import DryRun
-from .health import MOTOR_DROPPED_OUT, Health, Level, diagnostic_values
-from .link import SILENCE_LIMIT_S, UdpLink
+from .health import Health, Level, diagnostic_values, dropped_out
+from .link import SILENCE_LIMIT_S
+from .open_link import open_link
 from .parameters import DriverParameters
 from .remote import OperatorCommand, RemotePilot
-from .wire import BoardState
 
 OPERATOR_PERIOD_S = 0.02  # period of processing the remote and of cmd_vel_teleop
 PERIODS_PER_LOCK = 5  # a stop is published repeatedly, for nodes that start later
@@ -48,14 +50,14 @@ ORIENTATION_STD_RAD, ANGULAR_VELOCITY_STD, LINEAR_ACCELERATION_STD = 0.002, 0.01
 
 
 class Driver(Node):
-    """Publishes the states of a `UdpLink` and forwards commands to it."""
+    """Publishes the states of a `Link` and forwards commands to it."""
 
     def __init__(self) -> None:
         super().__init__("driver")
         self._settings = settings = read_parameters(self, DriverParameters)
-        self._dry_run = DryRun() if settings.dry_run else None
-        self._link = UdpLink(settings, self._on_state, settings.load_calibration(), self._dry_run)
-        self._health = Health(f"{settings.board_address}:{settings.board_port}")
+        opened = open_link(settings, self._on_state)
+        self._link, self._robot = opened.link, opened.robot
+        self._health = Health(opened.board, self._robot)
         self._pilot = RemotePilot(settings)
         self._orders: deque[OperatorCommand] = deque()
         self._newest: BoardState | None = None
@@ -72,8 +74,8 @@ class Driver(Node):
         self._enable_walking = self.create_client(SetBool, "controller/enable_walking")
         self.create_subscription(LowCmd, "low_cmd", self._on_command, 1)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        if self._dry_run:  # it may run next to a simulator, so it must not publish as a robot
-            self.create_timer(1.0, partial(self._show, self._dry_run), clock=steady)
+        if opened.dry_run:  # it may run next to a simulator, so it must not publish as a robot
+            self.create_timer(1.0, partial(self._show, opened.dry_run), clock=steady)
         else:
             self._create_publishers()
             self.create_timer(OPERATOR_PERIOD_S, self._serve_operator, clock=steady)
@@ -123,7 +125,7 @@ class Driver(Node):
         if self._view_decimator.accepts(robot.tick):
             self._view.publish(stamp, robot)
         if self._motor_decimator.accepts(robot.tick):
-            self._motors.publish(motor_status(stamp, state))
+            self._motors.publish(motor_status(stamp, state, self._robot))
 
     # Methods of the executor's thread.
 
@@ -217,7 +219,7 @@ class Driver(Node):
         report = self._link.report()
         level, summary = self._health.assess(report, self._newest, self._pilot.stopped)
         values = {
-            **diagnostic_values(report, self._newest),
+            **diagnostic_values(report, self._newest, self._robot),
             "stopped": self._pilot.stopped,
             **self._refusals.diagnostic_values(),
         }
@@ -228,12 +230,13 @@ class Driver(Node):
             self.get_logger().warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
 
 
-def motor_status(stamp: Any, state: BoardState) -> Any:
+def motor_status(stamp: Any, state: BoardState, robot: DrivenRobot) -> Any:
     """Build the motor_status message of a state.
 
     Args:
         stamp: Time of the state, a builtin_interfaces/Time.
         state: State of the board.
+        robot: Codes of the board.
 
     Returns:
         A quadvel_msgs/MotorStatus.
@@ -241,7 +244,7 @@ def motor_status(stamp: Any, state: BoardState) -> Any:
     return MotorStatus(
         stamp=stamp,
         temperature=state.temperature.astype(np.float32),
-        dropped_out=(state.motor_mode == MOTOR_DROPPED_OUT).tolist(),
+        dropped_out=dropped_out(state, robot).tolist(),
     )
 
 

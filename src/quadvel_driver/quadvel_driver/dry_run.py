@@ -2,39 +2,49 @@
 
 from __future__ import annotations
 
-import socket
-from typing import Any
+import time
+from collections import Counter
 
-from quadvel_description.robot import KINDS, LEGS
+from typing_extensions import override
 
-from . import wire
+from .driven_robot import DrivenRobot
+from .link import Transport, WireFormat
 
 SHOWN_BYTES = 11
-"""Header (10 bytes) and mode of the first motor."""
+"""First bytes of a packet that are shown: header, and for the AlienGo the mode of the first motor."""
 
 
-class DryRun(socket.socket):
-    """Replacement for the link's socket that keeps the last packet, sends nothing and receives nothing."""
+class DryRun(Transport):
+    """Connection that keeps the last packet, sends nothing and receives nothing."""
 
-    def __init__(self) -> None:
-        super().__init__(socket.AF_INET, socket.SOCK_DGRAM)  # not bound to a port
-        self.setblocking(False)
+    def __init__(self, robot: DrivenRobot, wire: WireFormat) -> None:
+        """Create a connection to nothing.
+
+        Args:
+            robot: Names of the joints.
+            wire: Format of the packets.
+        """
+        self.board, self.counts = "nothing", Counter()
+        self._robot, self._wire = robot, wire
         self._packet = b""
         self._count = 0
 
-    def send(self, data: Any, flags: int = 0) -> int:
-        """Keep a packet instead of sending it.
+    @override
+    def wait(self, timeout: float) -> None:
+        time.sleep(timeout)
 
-        Args:
-            data: The packet.
-            flags: Not used.
+    @override
+    def receive(self) -> bytes | None:
+        return None
 
-        Returns:
-            Number of bytes "sent".
-        """
-        self._packet = data
+    @override
+    def send(self, packet: bytes) -> None:
+        self._packet = packet
         self._count += 1
-        return len(data)
+
+    @override
+    def close(self) -> None:
+        pass
 
     def summary(self) -> str:
         """Describe the packets since the last call.
@@ -45,17 +55,20 @@ class DryRun(socket.socket):
         count, self._count = self._count, 0
         if not self._packet:
             return "no packet yet"
-        return f"{count} packets would have been sent, the last: {describe_packet(self._packet)}"
+        description = describe_packet(self._packet, self._robot, self._wire)
+        return f"{count} packets would have been sent, the last: {description}"
 
 
-def describe_packet(packet: bytes) -> str:
+def describe_packet(packet: bytes, robot: DrivenRobot, wire: WireFormat) -> str:
     """Describe a command packet: its first and last bytes, and one line per leg.
 
     Angles (rad) are those of the drives: joint angle plus `joint_zeros` of the calibration, clamped
     for the board. Speeds are in rad/s, torques in N m.
 
     Args:
-        packet: A packet of `wire.encode_command`.
+        packet: A packet of `encode_command`.
+        robot: Names of the joints.
+        wire: Format of the packet.
 
     Returns:
         Several lines of text.
@@ -64,10 +77,10 @@ def describe_packet(packet: bytes) -> str:
     lines = [
         f"{len(packet)} bytes, {packet[:SHOWN_BYTES].hex()} ... CRC 0x{int.from_bytes(packet[-4:], 'little'):08X}"
     ]
-    for leg, name in enumerate(LEGS):
-        joints = []
-        for i, kind in enumerate(KINDS, start=len(KINDS) * leg):
-            law = f"q {command.q[i]:+.3f} dq {command.dq[i]:+.2f} tau {command.tau[i]:+.2f}"
-            joints.append(f"{kind} {law} kp {command.kp[i]:g} kd {command.kd[i]:g}")
-        lines.append(f"  {name}: {'; '.join(joints)}")
+    legs: dict[str, list[str]] = {}
+    for i, joint in enumerate(robot.joint_names):
+        leg, _, kind = joint.removesuffix("_joint").partition("_")
+        law = f"q {command.q[i]:+.3f} dq {command.dq[i]:+.2f} tau {command.tau[i]:+.2f}"
+        legs.setdefault(leg, []).append(f"{kind} {law} kp {command.kp[i]:g} kd {command.kd[i]:g}")
+    lines += [f"  {leg}: {'; '.join(joints)}" for leg, joints in legs.items()]
     return "\n".join(lines)

@@ -7,14 +7,15 @@ from enum import IntEnum
 
 import numpy as np
 
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.arrays import Bools
 
+from .board_state import BoardState
+from .driven_robot import DrivenRobot
 from .link import SILENCE_LIMIT_S, LinkReport
 from .remote import BUTTONS, OperatorCommand
-from .wire import BoardState
 
 HOT_MOTOR_C = 70  # deg C, warning limit; the limit of the board is not published
-MOTOR_DROPPED_OUT = 8  # mode of a motor that the board has switched off
+LOW_BATTERY = 15  # %, warning limit; a Go2 with less than `min_battery` is not taken over
 BAD_DATAGRAMS = ("wrong_length", "wrong_crc", "unusable", "from_others")
 
 
@@ -32,13 +33,14 @@ Status = tuple[Level, str]
 class Health:
     """Assesses one link from report to report."""
 
-    def __init__(self, board: str) -> None:
+    def __init__(self, board: str, robot: DrivenRobot) -> None:
         """Create the assessment of a link.
 
         Args:
-            board: Address and port of the board, for messages.
+            board: Name of the board, for messages.
+            robot: Names of the joints, codes of the board.
         """
-        self._board = board
+        self._board, self._robot = board, robot
         self._before: dict[str, int] = {}
 
     def assess(self, report: LinkReport, newest: BoardState | None, stopped: bool) -> Status:
@@ -54,7 +56,8 @@ class Health:
         """
         problems = [
             *self._link_problems(report),
-            *_motor_problems(newest, report),
+            *self._motor_problems(newest, report),
+            *_battery_problems(newest),
             *_operator_problems(stopped),
         ]
         self._before = report.counts
@@ -71,29 +74,47 @@ class Health:
             since = "yet" if report.silence == float("inf") else f"for {report.silence:.1f} s"
             network = report.last_error if new["network_errors"] else ""
             frozen = "its tick stands still" if new["repeated"] > new["states"] else ""
-            reason = (
-                refusal
-                or frozen
-                or network
-                or "is the robot on and in low-level mode, and is this the right network?"
-            )
+            reason = refusal or frozen or network or self._robot.no_state_hint
             yield Level.ERROR, f"no state from {self._board} {since}: {reason}"
         elif refusal:
             bad = sum(new[name] for name in BAD_DATAGRAMS)
             yield Level.WARN, f"{bad} datagrams dropped in the last second, the last: {refusal}"
+        if report.takeover:
+            yield Level.ERROR, report.takeover
         if new["command_timeouts"]:
             yield Level.WARN, "low_cmd stopped: the joints were damped"
 
+    def _motor_problems(self, newest: BoardState | None, report: LinkReport) -> Iterator[Status]:
+        if newest is None or report.silence > SILENCE_LIMIT_S:
+            return
+        names, mode = self._robot.joint_names, self._robot.dropped_out_mode
+        for i in np.flatnonzero(dropped_out(newest, self._robot)):
+            error = f"mode {mode}, error {newest.motor_error[i]}"
+            yield Level.ERROR, f"{names[i]} has dropped out ({error}): stop the robot and let it cool down"
+        hottest = int(np.argmax(newest.temperature))
+        if newest.temperature[hottest] >= HOT_MOTOR_C:
+            yield Level.WARN, f"{names[hottest]} is at {newest.temperature[hottest]} deg C: let it rest"
 
-def _motor_problems(newest: BoardState | None, report: LinkReport) -> Iterator[Status]:
-    if newest is None or report.silence > SILENCE_LIMIT_S:
-        return
-    for i in np.flatnonzero(newest.motor_mode == MOTOR_DROPPED_OUT):
-        error = f"mode {MOTOR_DROPPED_OUT}, error {newest.motor_error[i]}"
-        yield Level.ERROR, f"{JOINT_NAMES[i]} has dropped out ({error}): stop the robot and let it cool down"
-    hottest = int(np.argmax(newest.temperature))
-    if newest.temperature[hottest] >= HOT_MOTOR_C:
-        yield Level.WARN, f"{JOINT_NAMES[hottest]} is at {newest.temperature[hottest]} deg C: let it rest"
+
+def dropped_out(state: BoardState, robot: DrivenRobot) -> Bools:
+    """Find the motors that the board has switched off.
+
+    Args:
+        state: State of the board.
+        robot: Codes of the board.
+
+    Returns:
+        Whether each has, (n,); all false if the code is not known.
+    """
+    if robot.dropped_out_mode is None:
+        return np.zeros(len(robot.joint_names), bool)
+    switched_off: Bools = state.motor_mode == robot.dropped_out_mode
+    return switched_off
+
+
+def _battery_problems(newest: BoardState | None) -> Iterator[Status]:
+    if newest is not None and newest.battery is not None and newest.battery.charge < LOW_BATTERY:
+        yield Level.WARN, f"the battery is at {newest.battery.charge} %: lie down and charge it"
 
 
 def _operator_problems(stopped: bool) -> Iterator[Status]:
@@ -102,12 +123,13 @@ def _operator_problems(stopped: bool) -> Iterator[Status]:
         yield Level.WARN, f"stopped by the remote; {release} release it"
 
 
-def diagnostic_values(report: LinkReport, newest: BoardState | None) -> dict[str, object]:
+def diagnostic_values(report: LinkReport, newest: BoardState | None, robot: DrivenRobot) -> dict[str, object]:
     """Return all values for /diagnostics.
 
     Args:
         report: The report of the link.
         newest: The newest state, None before the first one.
+        robot: Names of the joints.
 
     Returns:
         Values by name.
@@ -122,9 +144,12 @@ def diagnostic_values(report: LinkReport, newest: BoardState | None) -> dict[str
         "last_error": report.last_error,
     }
     if newest is not None:
-        for i, joint in enumerate(JOINT_NAMES):
+        for i, joint in enumerate(robot.joint_names):
             values[f"{joint} temperature"] = int(newest.temperature[i])
             values[f"{joint} mode"] = int(newest.motor_mode[i])
             values[f"{joint} error"] = int(newest.motor_error[i])
         values["imu temperature"] = newest.imu_temperature
+        if newest.battery is not None:
+            battery = newest.battery
+            values["battery"] = f"{battery.charge} %, {battery.voltage:.1f} V, {battery.current:.1f} A"
     return values

@@ -1,37 +1,41 @@
-"""UDP link to the robot's board: sends commands without a gap and receives the newest state. No ROS.
+"""Link to the robot's board: sends commands without a gap and receives the newest state. No ROS.
 
 The link runs in its own thread (`run`). It sends each command immediately and repeats the last one
 every 2 ms, so a lost packet costs 2 ms. It sends damping if commands stop, if the operator stops
 the robot, and at the end. The board itself brakes if packets stop.
+
+What depends on the robot is passed in: a `Transport` (UDP or DDS) carries packets, a `WireFormat`
+gives their bytes, a `DrivenRobot` the limits, and a `Takeover` decides whether anything may be sent.
 """
 
 from __future__ import annotations
 
 import math
-import select
-import socket
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
+from typing import Protocol
 
 import attrs
 import numpy as np
 
 from quadvel_description.fields import field, positive
-from quadvel_description.robot import COMMAND_LOWER, COMMAND_UPPER, TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_nodes.messages import QUATERNION_TOLERANCE
 
-from . import wire
 from .board_clock import BoardClock
+from .board_state import BoardState
 from .calibration import Calibration
-from .wire import BoardState, WireError
+from .driven_robot import DrivenRobot
+from .packets import CRC, LENGTH, WireError
+from .takeover import Access, Takeover
 
 SEND_PERIOD_S = 0.002  # longest time between two packets, as in Unitree's examples
 SHUTDOWN_PACKETS = 10  # number of damping packets at the end; some may be lost
 MAX_COMMAND_AGE_MS = 100  # largest age of the state that a command answers
-MAX_DATAGRAMS = 256  # received per turn, so that a flood cannot block sending
+MAX_PACKETS = 256  # received per turn, so that a flood cannot block sending
 SILENCE_LIMIT_S = 0.1  # time without a new state after which the board counts as silent
 _TICK_MODULUS = 2**32
 
@@ -43,15 +47,70 @@ class LinkError(ValueError):
     """A link cannot be opened; the text is the reason, in one sentence."""
 
 
-@attrs.frozen(kw_only=True, slots=False)  # for multiple inheritance
-class LinkConfig:
-    """Network addresses and braking of the link.
+class WireFormat(Protocol):
+    """Bytes of commands and states: a module such as `wire`."""
+
+    def encode_command(self, command: JointCommand, /) -> bytes:
+        """Encode a joint command; raise WireError if it cannot be sent."""
+
+    def decode_command(self, data: bytes, /) -> JointCommand:
+        """Decode a command; raise WireError if it is not a valid one."""
+
+    def decode_state(self, data: bytes, /) -> BoardState:
+        """Decode a packet; raise WireError if it is not a valid state."""
+
+
+class Transport(ABC):
+    """Carries packets between link and board. `send` may be called from any thread.
 
     Attributes:
-        board_address: IP address of the board.
-        board_port: UDP port of the board.
-        local_address: Local IP address; empty for any.
-        local_port: Local UDP port; 0 for any free one.
+        board: Name of the other end, for messages.
+        counts: Events since the start: `from_others`, packets of others than the board.
+    """
+
+    board: str
+    counts: Counter[str]
+
+    @abstractmethod
+    def wait(self, timeout: float) -> None:
+        """Wait for a packet.
+
+        Args:
+            timeout: Longest time, s.
+        """
+
+    @abstractmethod
+    def receive(self) -> bytes | None:
+        """Return the next packet of the board, or None if none waits.
+
+        Returns:
+            The packet.
+
+        Raises:
+            OSError: The network reports an error; more packets may wait.
+        """
+
+    @abstractmethod
+    def send(self, packet: bytes) -> None:
+        """Send a packet to the board.
+
+        Args:
+            packet: The packet.
+
+        Raises:
+            OSError: It cannot be sent.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the connection."""
+
+
+@attrs.frozen(kw_only=True, slots=False)  # for multiple inheritance
+class LinkConfig:
+    """Network interface and braking of a link.
+
+    Attributes:
         interface: Network interface to use exclusively; empty for any.
         command_timeout: Time without a command after which the link brakes, s.
         damping_kd: Damping gain of braking, N m s/rad.
@@ -60,26 +119,11 @@ class LinkConfig:
         ValueError: A number is out of range; raised by the constructor.
     """
 
-    board_address: str = field("192.168.123.10", "IP address of the robot's board")
-    board_port: int = field(8007, "UDP port of the board", at_least=1, at_most=65535, whole=True)
-    local_address: str = field("", "own IP address to use; empty: the one that reaches the board")
-    local_port: int = field(
-        8082,
-        "own UDP port, to which the board answers; 0: any that is free",
-        at_least=0,
-        at_most=65535,
-        whole=True,
-    )
     interface: str = field("", "network interface to use alone, such as eth0; empty: any")
     command_timeout: float = positive(
         0.02, "s without a new low_cmd after which the driver brakes the joints", at_most=0.5
     )
     damping_kd: float = positive(5.0, "gain with which it brakes them, N m s/rad", at_most=20.0)
-
-    @property
-    def board(self) -> tuple[str, int]:
-        """Address and port of the board."""
-        return self.board_address, self.board_port
 
 
 @attrs.frozen
@@ -96,6 +140,7 @@ class LinkReport:
         counts: Events since the start, see COUNTER_NAMES.
         last_refusal: Why the last refused datagram was not used.
         last_error: The last network error.
+        takeover: Why the link does not fully command the joints, see `Takeover.problem`.
     """
 
     state_rate: float
@@ -107,37 +152,44 @@ class LinkReport:
     counts: dict[str, int]
     last_refusal: str
     last_error: str
+    takeover: str = ""
 
 
-class UdpLink:
-    """UDP link to one board. All methods except `run` and `serve` may be called from any thread."""
+class Link:
+    """Link to one board. All methods except `run` and `serve` may be called from any thread."""
 
     def __init__(
         self,
+        robot: DrivenRobot,
+        wire: WireFormat,
+        transport: Transport,
         config: LinkConfig,
         on_state: Callable[[BoardState], None],
         calibration: Calibration = NO_CALIBRATION,
-        endpoint: socket.socket | None = None,
+        takeover: Takeover | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Open a link.
+        """Create a link.
 
         Args:
-            config: Addresses and braking.
+            robot: Names and limits of the joints.
+            wire: Bytes of commands and states.
+            transport: Connection to the board; the link closes it.
+            config: Braking.
             on_state: Called in the link's thread with each new state; `time` (s) is on `clock`,
                 `tick` in ms.
             calibration: Calibration of this robot, which corrects states and commands.
-            endpoint: A socket that replaces the connection to the board.
+            takeover: Right to command the joints; None for a board that obeys whoever sends.
             clock: A monotonic clock, s.
-
-        Raises:
-            LinkError: The socket cannot be opened.
         """
+        self._robot = robot
+        self._wire = wire
+        self._transport = transport
         self._config = config
         self._on_state = on_state
         self._calibration = calibration
+        self._takeover = takeover or Takeover()
         self._clock = clock
-        self._socket = endpoint or _connect(config)
         self._board_clock = BoardClock()
         self._lock = threading.Lock()  # guards the attributes below
         self._damping = self._encode(JointCommand.damping(config.damping_kd))
@@ -147,28 +199,29 @@ class UdpLink:
         self._send_next = -math.inf
         self._tick = 0
         self._last_state_at = -math.inf
+        self._newest: BoardState | None = None
         self._counts: Counter[str] = Counter()
         self._last_refusal = self._last_error = ""
         self._reported_at, self._reported = clock(), Counter[str]()
 
-    @property
-    def local_port(self) -> int:
-        """Local UDP port."""
-        return int(self._socket.getsockname()[1])
-
     def run(self) -> None:
-        """Send and receive until `stop`, then brake the robot and close the socket."""
+        """Send and receive until `stop` or an error, then brake the robot and close the connection."""
         try:
             while not self._is_stopped:
-                select.select([self._socket], [], [], self._time_until_sending())
+                self._transport.wait(self._time_until_sending())
                 self.serve()
-            self._send_shutdown_packets()
         finally:
-            self._socket.close()
+            try:
+                self._send_shutdown_packets()
+            finally:
+                self._transport.close()
 
     def serve(self) -> None:
-        """Receive pending datagrams and send if due; for callers with a clock of their own instead of `run`."""
+        """Receive pending packets and send if due; for callers with a clock of their own instead of `run`."""
         self._receive()
+        now = self._clock()
+        is_silent = now - self._last_state_at > SILENCE_LIMIT_S
+        self._takeover.update(now, None if is_silent else self._newest)
         self._send_if_due()
 
     def stop(self) -> None:
@@ -188,7 +241,7 @@ class UdpLink:
         packet = self._encode(command)
         with self._lock:
             self._packet, self._mode, self._commanded_at = packet, command.mode, self._clock()
-            if not self._is_braked:
+            if not self._is_braked and self._takeover.access is Access.FULL:
                 self._send(packet)
 
     def brake(self) -> None:
@@ -219,6 +272,7 @@ class UdpLink:
             now = self._clock()
             board = self._board_clock
             counts = Counter(self._counts)
+            counts.update(self._transport.counts)
             counts.update(repeated=board.repeated, late=board.late, board_restarts=board.restarts)
             elapsed = max(now - self._reported_at, 1e-9)
             rates = {name: (counts[name] - self._reported[name]) / elapsed for name in ("states", "sent")}
@@ -227,55 +281,54 @@ class UdpLink:
                 state_rate=rates["states"],
                 send_rate=rates["sent"],
                 silence=now - self._last_state_at,
-                commanded=self._is_fresh() and not self._is_braked,
+                commanded=self._commands_pass(),
                 tick_unit="" if board.unit is None else {1e-3: "ms", 1e-6: "us"}[board.unit],
                 counter_rate=board.rate,
                 counts={name: counts[name] for name in COUNTER_NAMES},
                 last_refusal=self._last_refusal,
                 last_error=self._last_error,
+                takeover=self._takeover.problem,
             )
 
     # Receiving.
 
     def _receive(self) -> None:
-        """Receive all pending datagrams and call `on_state` with the newest state."""
+        """Receive all pending packets and call `on_state` with the newest state."""
         newest = None
-        for datagram in self._datagrams():
-            state = self._accept(datagram)
+        for packet in self._packets():
+            state = self._accept(packet)
             if state is None:
                 continue
             if newest is not None:
                 self._count("superseded")
             newest = state
         if newest is not None:
+            self._newest = newest
             self._tick, self._last_state_at = newest.robot.tick, self._clock()
             self._count("states")
             self._on_state(newest)
 
-    def _datagrams(self) -> list[bytes]:
-        """Return the pending datagrams of the board."""
-        datagrams = []
-        for _ in range(MAX_DATAGRAMS):
+    def _packets(self) -> list[bytes]:
+        """Return the pending packets of the board."""
+        packets = []
+        for _ in range(MAX_PACKETS):
             try:
-                data, sender = self._socket.recvfrom(65536)
-            except BlockingIOError:
-                break
+                packet = self._transport.receive()
             except OSError as error:  # no such port on the board, or the network is down
                 self._note_error(error)
                 continue
-            if sender == self._socket.getpeername():
-                datagrams.append(data)
-            else:  # arrived between bind and connect; afterwards the kernel filters these
-                self._count("from_others")
-        return datagrams
+            if packet is None:
+                break
+            packets.append(packet)
+        return packets
 
-    def _accept(self, datagram: bytes) -> BoardState | None:
-        """Return the state of a datagram, or None if it is unusable or not newer."""
+    def _accept(self, packet: bytes) -> BoardState | None:
+        """Return the state of a packet, or None if it is unusable or not newer."""
         try:
-            state = wire.decode_state(datagram)
+            state = self._wire.decode_state(packet)
             _check_plausible(state.robot)
         except WireError as error:
-            self._count({wire.LENGTH: "wrong_length", wire.CRC: "wrong_crc"}.get(error.kind, "unusable"))
+            self._count({LENGTH: "wrong_length", CRC: "wrong_crc"}.get(error.kind, "unusable"))
             self._last_refusal = str(error)
             return None
         instant = self._board_clock.update(state.robot.tick, self._clock())
@@ -289,7 +342,8 @@ class UdpLink:
             self._counts[name] += 1
 
     def _encode(self, command: JointCommand) -> bytes:
-        return wire.encode_command(self._calibration.invert(clamp_for_board(command)))
+        sent = self._calibration.invert(clamp_for_board(command, self._robot))
+        return self._wire.encode_command(sent)
 
     # Sending. Except for `_send_if_due`, `_note_error` and `_send_shutdown_packets`, the caller locks.
 
@@ -305,15 +359,21 @@ class UdpLink:
             if self._was_fresh and not fresh:
                 self._counts["command_timeouts"] += 1
             self._was_fresh = fresh
-            self._send(self._packet if fresh and not self._is_braked else self._damping)
+            self._send(self._packet if self._commands_pass() else self._damping)
+
+    def _commands_pass(self) -> bool:
+        """Return whether the board receives commands, not the link's own damping."""
+        return self._is_fresh() and not self._is_braked and self._takeover.access is Access.FULL
 
     def _is_fresh(self) -> bool:
         return self._clock() - self._commanded_at <= self._config.command_timeout
 
     def _send(self, packet: bytes) -> None:
         self._send_next = self._clock() + SEND_PERIOD_S
+        if self._takeover.access is Access.NONE:
+            return
         try:
-            self._socket.send(packet)
+            self._transport.send(packet)
             self._counts["sent"] += 1
         except OSError as error:
             self._counts["network_errors"] += 1
@@ -361,31 +421,32 @@ COUNTER_NAMES = (
 
 states: passed to `on_state`; sent: packets; superseded: states replaced by a newer one in the same
     turn;
-repeated, late: see `BoardClock`; wrong_length, wrong_crc, unusable, from_others: refused datagrams;
+repeated, late: see `BoardClock`; wrong_length, wrong_crc, unusable, from_others: refused packets;
 command_timeouts: times that commands stopped; board_restarts: restarts of the board's counter;
-network_errors: errors of the socket.
+network_errors: errors of the connection.
 """
 
 
-def clamp_for_board(command: JointCommand) -> JointCommand:
+def clamp_for_board(command: JointCommand, robot: DrivenRobot) -> JointCommand:
     """Clamp a command to the limits of the robot, and replace damping mode by a servo without stiffness.
 
-    The board does not define the damping of mode 0, so braking is sent as mode 10 with kp = 0 and
-    the requested kd.
+    Boards do not define the damping of mode 0, so braking is sent as a servo with kp = 0 and the
+    requested kd.
 
     Args:
         command: The joint command.
+        robot: Limits of the joints.
 
     Returns:
         The command to encode.
     """
     braking = command.mode == MODE_DAMPING
     return JointCommand(
-        q=np.minimum(np.maximum(command.q, COMMAND_LOWER), COMMAND_UPPER),
-        dq=np.minimum(np.maximum(command.dq, -VELOCITY_LIMIT), VELOCITY_LIMIT),
+        q=np.minimum(np.maximum(command.q, robot.command_lower), robot.command_upper),
+        dq=np.minimum(np.maximum(command.dq, -robot.velocity_limit), robot.velocity_limit),
         tau=0.0 * command.tau
         if braking
-        else np.minimum(np.maximum(command.tau, -TORQUE_LIMIT), TORQUE_LIMIT),
+        else np.minimum(np.maximum(command.tau, -robot.torque_limit), robot.torque_limit),
         kp=0.0 * command.kp if braking else command.kp,
         kd=command.kd,
         mode=MODE_SERVO if braking else command.mode,
@@ -401,23 +462,3 @@ def _check_plausible(robot: RobotState) -> None:
     if abs(length - 1.0) > QUATERNION_TOLERANCE:
         zeros = ", and all joints are at 0" if not robot.q.any() else ""
         raise WireError(f"state: quaternion has length {length:.3g}, expected 1{zeros}")
-
-
-def _connect(config: LinkConfig) -> socket.socket:
-    """Return a socket connected to the board; raise LinkError on failure."""
-    endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    local = config.local_address, config.local_port
-    try:
-        endpoint.setblocking(False)
-        if config.interface:
-            endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, config.interface.encode())
-        endpoint.bind(local)
-        endpoint.connect(config.board)
-    except (OSError, OverflowError) as error:
-        endpoint.close()
-        own = f"{config.local_address or 'any address'}:{config.local_port}"
-        on = f" on {config.interface}" if config.interface else ""
-        raise LinkError(
-            f"no link from {own}{on} to {config.board_address}:{config.board_port}: {error}"
-        ) from error
-    return endpoint

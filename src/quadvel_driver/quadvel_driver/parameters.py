@@ -8,22 +8,27 @@ from quadvel_description.fields import field
 from quadvel_nodes.scheduling import Scheduling
 
 from .calibration import Calibration
-from .link import NO_CALIBRATION, LinkConfig
+from .link import NO_CALIBRATION
 from .remote import RemoteConfig
+from .udp import UdpConfig
+from .unitree_dds.transport import DdsConfig
 
-MAX_STATE_RATE_HZ = 1000  # rate of the board
+MAX_STATE_RATE_HZ = 1000  # rate of the AlienGo's board; that of a Go2 reports at 500 Hz
+ROBOTS = ("aliengo", "go2")
 
 
 @attrs.frozen(kw_only=True)
-class DriverParameters(LinkConfig, RemoteConfig, Scheduling):
+class DriverParameters(UdpConfig, DdsConfig, RemoteConfig, Scheduling):
     """Parameters of link, remote and scheduling, and of the node itself.
 
     Attributes:
+        robot: Kind of robot, one of ROBOTS.
         state_rate: Rate of low_state, Hz.
         calibration: Calibration file of this robot; empty for none.
         dry_run: Whether to show packets instead of sending them.
     """
 
+    robot: str = field("aliengo", f"the robot: {' (UDP) or '.join(ROBOTS)} (DDS)", one_of=ROBOTS)
     state_rate: int = field(
         200,
         "rate of low_state, Hz, up to 1000; the board's own is the highest",

@@ -20,7 +20,7 @@ import numpy as np
 from quadvel_description.arrays import Array
 from quadvel_description.fields import field
 
-from .wire import Button, Remote
+from .board_state import Button, Remote
 
 ZERO_VELOCITY_S = 0.5  # zero velocity after the sticks are released; then other sources take over
 

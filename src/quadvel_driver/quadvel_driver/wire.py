@@ -10,13 +10,9 @@ so that no flipped bit passes.
 
 from __future__ import annotations
 
-import math
-import zlib
-from enum import IntFlag
 from itertools import accumulate
 from typing import Any, Final
 
-import attrs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,9 +20,23 @@ from quadvel_description.arrays import Array
 from quadvel_description.robot import JOINT_NAMES, LEGS
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 
+from .board_state import BoardState
+from .packets import (
+    FLOAT32_MAX,
+    LENGTH,
+    POSITION_OFF,
+    VELOCITY_OFF,
+    WireError,
+    check_crc,
+    crc,
+    decode_remote,
+    encode_remote,
+    not_finite,
+    roll_pitch_yaw,
+)
+
 JOINTS = len(JOINT_NAMES)
 LOW_LEVEL = 0xFF  # levelFlag of a joint command
-POSITION_OFF, VELOCITY_OFF = 2.146e9, 16000.0  # q and dq that disable the stiffness or damping term
 
 _HEADER = [
     ("level_flag", "u1"),
@@ -67,12 +77,6 @@ _STATE: Final = np.dtype(
         *(("foot_force", "<i2", 4), ("foot_force_estimate", "<i2", 4), ("tick", "<u4"), *_TAIL),
     ]
 )
-_REMOTE: Final = np.dtype(
-    [
-        *(("head", "V2"), ("buttons", "<u2"), ("lx", "<f4"), ("rx", "<f4"), ("ry", "<f4")),
-        *(("reserve", "V4"), ("ly", "<f4"), ("idle", "V16")),
-    ]
-)
 COMMAND_BYTES, STATE_BYTES = _COMMAND.itemsize, _STATE.itemsize
 """Lengths of the packets: 610 and 771."""
 
@@ -96,7 +100,6 @@ _COMMAND_MAX = np.array(
     [[100.0], [1000.0], *([(_COUNTS - 1) / scale] for scale in (_TAU_COUNTS_PER_NM, _KP, _KD))]
 )
 _COMMAND_FIELDS = ("q", "dq", "tau", "kp", "kd")
-_FLOAT32_MAX = float(np.finfo(np.float32).max)
 _STATE_LENGTHS = {
     **dict.fromkeys(("q", "dq", "tau"), JOINTS),
     **{"quaternion": 4, "angular_velocity": 3, "linear_acceleration": 3, "foot_force": 4},
@@ -108,88 +111,6 @@ _STATE_SLICES = {
 }
 
 _AXES = ("w", "x", "y", "z")
-_BITS_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
-
-
-LENGTH, CRC, CONTENT = "length", "CRC", "content"
-
-
-class WireError(ValueError):
-    """A packet must not be used, or a record cannot be sent; the text names the value found and expected.
-
-    Attributes:
-        kind: LENGTH, CRC or CONTENT.
-    """
-
-    def __init__(self, text: str, kind: str = CONTENT) -> None:
-        super().__init__(text)
-        self.kind = kind
-
-
-class Button(IntFlag):
-    """Buttons of the wireless remote, as bits of the packet."""
-
-    R1, L1, START, SELECT = 0x0001, 0x0002, 0x0004, 0x0008
-    R2, L2, F1, F2 = 0x0010, 0x0020, 0x0040, 0x0080
-    A, B, X, Y = 0x0100, 0x0200, 0x0400, 0x0800
-    UP, RIGHT, DOWN, LEFT = 0x1000, 0x2000, 0x4000, 0x8000
-
-
-@attrs.frozen
-class Remote:
-    """State of the wireless remote.
-
-    Attributes:
-        buttons: Pressed buttons.
-        lx: Left stick to the right, -1 to 1.
-        ly: Left stick forward, -1 to 1.
-        rx: Right stick to the right, -1 to 1.
-        ry: Right stick forward, -1 to 1. All sticks are 0 if the remote is off.
-    """
-
-    buttons: Button = Button(0)
-    lx: float = 0.0
-    ly: float = 0.0
-    rx: float = 0.0
-    ry: float = 0.0
-
-
-@attrs.define
-class BoardState:
-    """State as the board sends it.
-
-    Attributes:
-        robot: State of the robot; `tick` is the board's counter in its own unit, `time` is 0, and
-            `foot_force` holds raw sensor counts.
-        motor_mode: (12,), 10 driven, 0 braking, 8 dropped out.
-        motor_error: Error codes, (12,), 0 for none.
-        temperature: Motor temperatures, (12,), deg C.
-        imu_temperature: deg C.
-        remote: State of the wireless remote.
-    """
-
-    robot: RobotState
-    motor_mode: NDArray[np.uint8]
-    motor_error: NDArray[np.uint32]
-    temperature: NDArray[np.int8]
-    imu_temperature: int = 0
-    remote: Remote = Remote()
-
-
-def crc(data: bytes) -> int:
-    """Compute the CRC of the board: CRC-32/MPEG-2 over little-endian 4-byte words, highest bit first.
-
-    Args:
-        data: Whole words.
-
-    Returns:
-        The CRC.
-    """
-    # zlib computes the reflected CRC-32 (polynomial 0x04C11DB7). Reversing the bits of input bytes and
-    # result gives the CRC without reflection; MPEG-2 has no final inversion.
-    words = np.frombuffer(data, "<u4").byteswap().tobytes()
-    reflected = zlib.crc32(words.translate(_BITS_REVERSED)) ^ 0xFFFFFFFF
-    return int.from_bytes(reflected.to_bytes(4, "little").translate(_BITS_REVERSED), "big")
 
 
 def encode_command(command: JointCommand) -> bytes:
@@ -211,7 +132,7 @@ def encode_command(command: JointCommand) -> bytes:
         raise WireError(f"command: mode is {command.mode}, expected {MODE_DAMPING} or {MODE_SERVO}")
     numbers = np.array((command.q, command.dq, command.tau, command.kp, command.kd), float)
     if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
-        raise _not_finite("command", dict(zip(_COMMAND_FIELDS, numbers, strict=True)))
+        raise not_finite("command", dict(zip(_COMMAND_FIELDS, numbers, strict=True)), _location)
     numbers = np.minimum(np.maximum(numbers, _COMMAND_MIN), _COMMAND_MAX).astype(np.float32)
     packet = np.zeros(1, _COMMAND)
     packet["level_flag"] = LOW_LEVEL
@@ -244,7 +165,7 @@ def decode_command(data: bytes) -> JointCommand:
     motors = packet["motors"][:JOINTS]
     numbers = np.concatenate((motors["q"], motors["dq"]))
     if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # before the cast, which warns of NaN
-        raise _not_finite("command", {"q": motors["q"], "dq": motors["dq"]})
+        raise not_finite("command", {"q": motors["q"], "dq": motors["dq"]}, _location)
     q, dq = numbers.astype(float).reshape(2, JOINTS)
     no_position, no_velocity = q >= POSITION_OFF, dq >= VELOCITY_OFF
     mode = _mode(motors["mode"])
@@ -289,18 +210,18 @@ def encode_state(state: BoardState) -> bytes:
     robot = state.robot
     numbers = np.concatenate([getattr(robot, field) for field in _STATE_SLICES])
     if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
-        raise _not_finite("state", {field: getattr(robot, field) for field in _STATE_SLICES})
-    numbers = np.minimum(np.maximum(numbers, -_FLOAT32_MAX), _FLOAT32_MAX)
+        raise not_finite("state", {field: getattr(robot, field) for field in _STATE_SLICES}, _location)
+    numbers = np.minimum(np.maximum(numbers, -FLOAT32_MAX), FLOAT32_MAX)
     clipped = {field: numbers[part] for field, part in _STATE_SLICES.items()}
     packet = np.zeros(1, _STATE)
     for field in ("quaternion", "angular_velocity", "linear_acceleration"):
         packet[field] = clipped[field]
     packet["level_flag"] = LOW_LEVEL
-    packet["rpy"] = _roll_pitch_yaw(clipped["quaternion"])
+    packet["rpy"] = roll_pitch_yaw(clipped["quaternion"])
     packet["foot_force"] = packet["foot_force_estimate"] = _counts(clipped["foot_force"])
     packet["imu_temperature"] = state.imu_temperature
     packet["tick"] = robot.tick
-    packet["remote"] = _remote_bytes(state.remote)
+    packet["remote"] = np.void(encode_remote(state.remote))
     motors = packet["motors"][0, :JOINTS]
     motors["q_raw"], motors["dq_raw"] = clipped["q"], clipped["dq"]
     motors["q"], motors["dq"], motors["tau"] = (
@@ -335,7 +256,7 @@ def decode_state(data: bytes) -> BoardState:
     if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # before the cast, which warns of NaN
         fields = ("quaternion", "angular_velocity", "linear_acceleration")
         found = {"q": motors["q"], "dq": motors["dq"], **{field: packet[field] for field in fields}}
-        raise _not_finite("state", found)
+        raise not_finite("state", found, _location)
     numbers = numbers.astype(float)
     imu = numbers[2 * JOINTS :]
     robot = RobotState(
@@ -355,7 +276,7 @@ def decode_state(data: bytes) -> BoardState:
         motor_error=motors["error"].copy(),
         temperature=motors["temperature"].copy(),
         imu_temperature=int(packet["imu_temperature"]),
-        remote=_remote(packet["remote"].tobytes()),
+        remote=decode_remote(packet["remote"].tobytes()),
     )
 
 
@@ -370,9 +291,7 @@ def _unpack(data: bytes, kind: str, layout: np.dtype[Any]) -> np.void:
         raise WireError(
             f"{kind}: reserve ends with {data[covered:end].hex()}, expected zeros: the CRC does not cover it"
         )
-    found_crc, expected = int.from_bytes(data[end:], "little"), crc(data[:covered])
-    if found_crc != expected:
-        raise WireError(f"{kind}: CRC is 0x{found_crc:08X}, expected 0x{expected:08X}", CRC)
+    check_crc(kind, data[end:], data[:covered])
     packet: np.void = np.frombuffer(data, layout)[0]
     return packet
 
@@ -399,47 +318,8 @@ def _mode(modes: NDArray[np.uint8]) -> int:
     return MODE_SERVO if (modes == MODE_SERVO).any() else MODE_DAMPING
 
 
-def _roll_pitch_yaw(quaternion: Array) -> tuple[float, float, float]:
-    """Return the angles (rad) of rotations about z, y, x in this order; zeros for a zero quaternion."""
-    length = math.hypot(*quaternion.tolist())
-    w, x, y, z = (quaternion / length).tolist() if length > 0.0 else (1.0, 0.0, 0.0, 0.0)
-    return (
-        math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
-        math.asin(max(-1.0, min(2.0 * (w * y - z * x), 1.0))),
-        math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-    )
-
-
 def _counts(values: Array) -> NDArray[np.int16]:
     return np.clip(np.trunc(values), -_COUNTS, _COUNTS - 1).astype(np.int16)
-
-
-def _remote_bytes(remote: Remote) -> np.void:
-    fields = np.zeros(1, _REMOTE)
-    fields["buttons"] = int(remote.buttons)
-    for stick in ("lx", "ly", "rx", "ry"):
-        fields[stick] = getattr(remote, stick)
-    return np.void(fields.tobytes())
-
-
-def _remote(data: bytes) -> Remote:
-    """Decode the remote; non-finite sticks read as a remote that is off, as no state is refused for them."""
-    fields = np.frombuffer(data, _REMOTE)[0]
-    sticks = {stick: float(fields[stick]) for stick in ("lx", "ly", "rx", "ry")}
-    if not np.isfinite(list(sticks.values())).all():
-        return Remote()
-    return Remote(Button(int(fields["buttons"])), **sticks)
-
-
-def _not_finite(kind: str, numbers: dict[str, Array]) -> WireError:
-    """Return the error for the first field with a number that is not finite."""
-    for field, values in numbers.items():
-        for i, value in enumerate(values):
-            if not np.isfinite(value):
-                return WireError(
-                    f"{kind}: {field} of {_location(field, i)} is {value}, expected a finite number"
-                )
-    raise AssertionError("all are finite")
 
 
 def _location(field: str, i: int) -> str:

@@ -1,6 +1,6 @@
-"""ROS node `board`: the simulated robot behind the AlienGo's UDP interface.
+"""ROS node `board`: the simulated robot behind the interface of an AlienGo (UDP) or a Go2 (DDS).
 
-States and commands use UDP only. The ROS side offers the ground truth, the services of the
+States and commands use this interface only. The ROS side offers the ground truth, the services of the
 simulation, and the topic `~/remote`. A joystick on that topic replaces the wireless remote: axes
 lx, ly, rx, ry, and the buttons in the order of their bits in the protocol.
 """
@@ -14,24 +14,27 @@ from sensor_msgs.msg import Joy
 from typing_extensions import override
 
 from quadvel_description.state import RobotState
-from quadvel_driver.wire import Button, Remote
+from quadvel_driver.board_state import Button, Remote
+from quadvel_driver.unitree_dds.bus import Bus
 from quadvel_nodes.node import run
 from quadvel_sim.board import Board
+from quadvel_sim.dds_board import DdsBoard
 from quadvel_sim.loop import LoopReport
 from quadvel_sim.parameters import BoardParameters
 from quadvel_sim.simulation_node import SimulationNode
+from quadvel_sim.udp_board import UdpBoard
 
 STICK_AXES = ("lx", "ly", "rx", "ry")
 
 
 class BoardNode(SimulationNode[BoardParameters]):
-    """ROS node of a simulated robot behind a UDP port."""
+    """ROS node of a simulated robot behind its packets."""
 
     def __init__(self) -> None:
         """Start the board and the simulation."""
         super().__init__("board", BoardParameters)
         settings = self._settings
-        self._board = Board((settings.address, settings.port), settings, settings.calibration())
+        self._board = make_board(settings)
         self._board.loop = self._loop
         self._refused_before = 0
         self._network = Thread(target=self._board.run, name="network")
@@ -57,13 +60,30 @@ class BoardNode(SimulationNode[BoardParameters]):
     def warning_text(self, report: LoopReport) -> str:
         refused = sum(count for name, count in self._board.counts.items() if name != "commands")
         new, self._refused_before = refused - self._refused_before, refused
-        return f"{new} datagrams dropped in the last second: {self._board.last_refusal}" if new else ""
+        return f"{new} packets dropped in the last second: {self._board.last_refusal}" if new else ""
 
     def _on_remote(self, message: Any) -> None:
         """Take axes and buttons of a joystick as state of the wireless remote."""
         axes, buttons = [*message.axes, 0.0, 0.0, 0.0, 0.0], message.buttons[: len(Button)]
         pressed = sum(bit for bit, is_down in zip(Button, buttons, strict=False) if is_down)
         self._board.remote = Remote(Button(pressed), **dict(zip(STICK_AXES, axes, strict=False)))
+
+
+def make_board(settings: BoardParameters) -> Board:
+    """Create the board of a kind of robot.
+
+    Args:
+        settings: Kind of robot, addresses, faults of network and sensors.
+
+    Returns:
+        The board, without a simulation.
+
+    Raises:
+        ValueError: The address cannot be used.
+    """
+    if settings.robot == "go2":
+        return DdsBoard(Bus(settings.dds_domain, settings.interface), settings, settings.calibration())
+    return UdpBoard((settings.address, settings.port), settings, settings.calibration())
 
 
 def main(args: list[str] | None = None) -> None:

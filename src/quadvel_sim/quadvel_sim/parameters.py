@@ -9,6 +9,8 @@ from typing_extensions import override
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.fields import field
 from quadvel_driver.calibration import Calibration
+from quadvel_driver.parameters import ROBOTS
+from quadvel_driver.unitree_dds.bus import MAX_DOMAIN
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.config import SensorNoise, SimulatorConfig
@@ -167,11 +169,18 @@ class SimParameters(PlantParameters):
 
 @attrs.frozen(kw_only=True)
 class BoardParameters(PlantParameters, NetworkConfig):
-    """Parameters of the node `board`: address and network faults."""
+    """Parameters of the node `board`: kind of robot, address and network faults."""
 
+    robot: str = field(
+        "aliengo",
+        f"whose packets: {' (UDP) or '.join(ROBOTS)} (DDS); the physics are the AlienGo's",
+        one_of=ROBOTS,
+    )
     state_rate: int = field(1000, "rate of the states, Hz: a divisor of 1000, 50 at least")
     address: str = field("127.0.0.1", "IP address on which the board listens")
     port: int = field(8007, "UDP port on which the board listens; 0: any that is free")
+    dds_domain: int = field(1, "DDS domain of a Go2", at_least=0, at_most=MAX_DOMAIN, whole=True)
+    interface: str = field("lo", "network interface of a Go2; empty: any")
     joint_zeros: tuple[float, ...] = field(12 * (0.0,), "reading of the encoders at zero, rad")
     imu_mounting: tuple[float, ...] = field((0.0, 0.0), "tilt of the IMU about x and y, rad")
 

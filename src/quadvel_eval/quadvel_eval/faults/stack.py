@@ -16,6 +16,7 @@ import numpy as np
 
 from quadvel_description.arrays import Array
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
+from quadvel_driver.aliengo import ALIENGO
 from quadvel_driver.link import MAX_COMMAND_AGE_MS, clamp_for_board
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
@@ -288,7 +289,7 @@ class Stack:
             return
         if 0 <= self.now - command.tick <= MAX_COMMAND_AGE_MS:
             self.robot_command_mode = command.mode
-            self.simulator.command(clamp_for_board(command))
+            self.simulator.command(clamp_for_board(command, ALIENGO))
 
 
 def corrupt(message: Message, rng: np.random.Generator) -> Message:

@@ -1,0 +1,141 @@
+"""Parts that the packets of all of Unitree's boards share: CRC, wireless remote, errors. No sockets."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import numpy as np
+
+from quadvel_description.arrays import Array
+
+from .board_state import Button, Remote
+
+POSITION_OFF, VELOCITY_OFF = 2.146e9, 16000.0  # q and dq that disable the stiffness or damping term
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+LENGTH, CRC, CONTENT = "length", "CRC", "content"
+_BITS_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+_STICKS = ("lx", "ly", "rx", "ry")
+REMOTE: Final = np.dtype(
+    [
+        *(("head", "V2"), ("buttons", "<u2"), ("lx", "<f4"), ("rx", "<f4"), ("ry", "<f4")),
+        *(("reserve", "V4"), ("ly", "<f4"), ("idle", "V16")),
+    ]
+)
+"""Layout of the wireless remote, 40 bytes."""
+
+
+class WireError(ValueError):
+    """A packet must not be used, or a record cannot be sent; the text names the value found and expected.
+
+    Attributes:
+        kind: LENGTH, CRC or CONTENT.
+    """
+
+    def __init__(self, text: str, kind: str = CONTENT) -> None:
+        super().__init__(text)
+        self.kind = kind
+
+
+def crc(data: bytes) -> int:
+    """Compute the CRC of the board: CRC-32/MPEG-2 over little-endian 4-byte words, highest bit first.
+
+    Args:
+        data: Whole words.
+
+    Returns:
+        The CRC.
+    """
+    # zlib computes the reflected CRC-32 (polynomial 0x04C11DB7). Reversing the bits of input bytes and
+    # result gives the CRC without reflection; MPEG-2 has no final inversion.
+    words = np.frombuffer(data, "<u4").byteswap().tobytes()
+    reflected = zlib.crc32(words.translate(_BITS_REVERSED)) ^ 0xFFFFFFFF
+    return int.from_bytes(reflected.to_bytes(4, "little").translate(_BITS_REVERSED), "big")
+
+
+def check_crc(kind: str, found: bytes, covered: bytes) -> None:
+    """Check the CRC of a packet.
+
+    Args:
+        kind: Kind of packet, for the error.
+        found: The CRC in the packet, 4 bytes.
+        covered: The bytes that it covers, whole words.
+
+    Raises:
+        WireError: The CRC differs.
+    """
+    value, expected = int.from_bytes(found, "little"), crc(covered)
+    if value != expected:
+        raise WireError(f"{kind}: CRC is 0x{value:08X}, expected 0x{expected:08X}", CRC)
+
+
+def encode_remote(remote: Remote) -> bytes:
+    """Encode the wireless remote.
+
+    Args:
+        remote: Its state.
+
+    Returns:
+        40 bytes.
+    """
+    fields = np.zeros(1, REMOTE)
+    fields["buttons"] = int(remote.buttons)
+    for stick in _STICKS:
+        fields[stick] = getattr(remote, stick)
+    return fields.tobytes()
+
+
+def decode_remote(data: bytes) -> Remote:
+    """Decode the wireless remote.
+
+    Args:
+        data: 40 bytes.
+
+    Returns:
+        Its state; that of a remote that is off if a stick is not finite, as no state is refused for it.
+    """
+    fields = np.frombuffer(data, REMOTE)[0]
+    sticks = {stick: float(fields[stick]) for stick in _STICKS}
+    if not all(map(math.isfinite, sticks.values())):
+        return Remote()
+    return Remote(Button(int(fields["buttons"])), **sticks)
+
+
+def roll_pitch_yaw(quaternion: Array) -> tuple[float, float, float]:
+    """Return the angles of rotations about z, y, x in this order.
+
+    Args:
+        quaternion: (w, x, y, z), of any length.
+
+    Returns:
+        Roll, pitch and yaw, rad; zeros for a zero quaternion.
+    """
+    length = math.hypot(*quaternion.tolist())
+    w, x, y, z = (quaternion / length).tolist() if length > 0.0 else (1.0, 0.0, 0.0, 0.0)
+    return (
+        math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+        math.asin(max(-1.0, min(2.0 * (w * y - z * x), 1.0))),
+        math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+    )
+
+
+def not_finite(kind: str, numbers: Mapping[str, Array], location: Callable[[str, int], str]) -> WireError:
+    """Create the error for the first field with a number that is not finite.
+
+    Args:
+        kind: Kind of packet.
+        numbers: Fields by name, of which one holds such a number.
+        location: Name of the i-th number of a field.
+
+    Returns:
+        The error.
+    """
+    for field, values in numbers.items():
+        for i, value in enumerate(values):
+            if not np.isfinite(value):
+                return WireError(
+                    f"{kind}: {field} of {location(field, i)} is {value}, expected a finite number"
+                )
+    raise AssertionError("all are finite")
