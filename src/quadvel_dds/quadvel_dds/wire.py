@@ -363,7 +363,7 @@ class WaitSet:
         """
         places = self._triggered
         count = self.dds._waitset_wait(self.dds._ref, places, len(places), timeout_ns)
-        found = {self._reader_at[place] for place in places[: max(count, 0)]}
+        found = {self._reader_at[place] for place in places[: max(count, 0)] if place}
         if None in found:
             with contextlib.suppress(DDSException):  # the participant has left
                 self.guard.take()
