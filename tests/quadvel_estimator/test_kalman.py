@@ -204,6 +204,13 @@ def test_reset_forgets_one_robot_of_a_batch_and_keeps_the_others(trot: Trot) -> 
     np.testing.assert_allclose(velocity[:, 0], 0.8, atol=0.02)
 
 
+def test_a_series_ends_where_one_sample_after_the_other_ends(trot: Trot) -> None:
+    walk, estimator = trot(0.8, 30), KalmanEstimator(CONFIG)
+    for part in (walk[:10], walk[10:11], walk[11:]):
+        velocity, _ = estimator.update_series([state.time for state in part], stack(part))
+    np.testing.assert_allclose(velocity, run(KalmanEstimator(CONFIG), walk)[-1], atol=1e-9)
+
+
 def test_the_covariance_is_symmetric_and_grows_without_contact(standing: State) -> None:
     estimator = KalmanEstimator(CONFIG)
     run(estimator, [standing(DT * i) for i in range(100)])

@@ -155,6 +155,8 @@ def test_a_command_starts_walking_once_the_operator_allows_it(
     robot.step(5)
     robot.order(0.5)
     robot.step(5)
+    robot.graph.node._report()  # once a second
+    robot.step(5)
     report = robot.report("walk")
     assert report.mode == ControllerState.WALK
     assert report.walk_allowed

@@ -133,7 +133,9 @@ class EstimatorNode(Node):
         self._publish_velocity(stamp, state, estimate)
         self._count += 1
         self._busy_s += perf_counter() - start
-        if self._count % ESTIMATES_PER_ODOMETRY == 0:
+        if self._count % ESTIMATES_PER_ODOMETRY == 0 and (
+            self._odom.get_subscription_count() or self._tf.get_subscription_count()
+        ):
             self._publish_odometry(Time(sec=stamp[0], nanosec=stamp[1]), state, estimate)
 
     def _on_reset_odometry(self, request: Any, response: Any) -> Any:
