@@ -143,7 +143,7 @@ def test_each_leg_tells_the_velocity_that_lets_its_contact_point_rest(standing: 
     dq, omega = rng.normal(size=12), rng.normal(size=3)
     attitude = Rotation.from_euler("ZYX", [1.0, 0.3, -0.2])
     state = standing(0.0, q=q, dq=dq, angular_velocity=omega, quaternion=attitude.as_quat(scalar_first=True))
-    velocity_by_leg = leg_velocity(state)
+    velocity_by_leg = leg_velocity(state, rotation_matrix(state.quaternion))
 
     def calf(q: np.ndarray, leg: int) -> Rotation:
         hip, thigh, knee = q[3 * leg : 3 * leg + 3]

@@ -112,6 +112,7 @@ class KalmanEstimator:
         self._state = np.zeros((*shape, 5, 3))
         self._covariance = np.zeros((*shape, 5, 5))
         self._speed_variance = np.zeros((*shape, 4))
+        self._transition, self._gain = np.eye(5), np.zeros(5)  # F and G of `_predict`
         self.reset()
 
     def reset(self, ids: Any = None) -> None:
@@ -214,8 +215,8 @@ class KalmanEstimator:
         v' = v + a dt,   r_i' = r_i - v dt - a dt^2 / 2
         P' = F P F^T + sigma_a^2 G G^T,   G = (dt, -dt^2 / 2, ..., -dt^2 / 2)
         """
-        gain, transition = np.full(5, -0.5 * dt * dt), np.eye(5)
-        gain[0], transition[1:, 0] = dt, -dt
+        gain, transition = self._gain, self._transition
+        gain[0], gain[1:], transition[1:, 0] = dt, -0.5 * dt * dt, -dt
         self._state = transition @ self._state + gain[:, None] * acceleration[..., None, :]
         noise = gain[:, None] * gain * self.config.accelerometer**2
         self._covariance = transition @ self._covariance @ transition.T + noise
@@ -245,8 +246,7 @@ class KalmanEstimator:
         self._state[..., 1:, :] += rolling * dt
         before, self._speed_variance = self._speed_variance, speed_variance
         walk = self.config.foot_walk**2 + np.maximum(before, speed_variance) * SPEED_CORRELATION_S
-        diagonal = np.einsum("...ii->...i", self._covariance)  # a view
-        diagonal[..., 1:] += walk * dt
+        _diagonal(self._covariance)[..., 1:] += walk * dt
 
     def _correct(self, feet: Array, leg_velocity: Array, speed_variance: Array) -> None:
         """Correct with the trunk velocity from the legs (z_0) and the feet (z_1..z_4).
@@ -262,13 +262,19 @@ class KalmanEstimator:
         mean = (weight[..., None, :] @ leg_velocity) / total[..., None]
 
         innovation_covariance = self._covariance.copy()
-        diagonal = np.einsum("...ii->...i", innovation_covariance)  # a view
+        diagonal = _diagonal(innovation_covariance)
         diagonal[..., :1] += 1.0 / total
         diagonal[..., 1:] += self.config.foot_position**2
         gain = np.linalg.solve(innovation_covariance, self._covariance).swapaxes(-1, -2)
         self._state = self._state + gain @ (np.concatenate([mean, feet], axis=-2) - self._state)
         covariance = self._covariance - gain @ self._covariance
         self._covariance = 0.5 * (covariance + covariance.swapaxes(-1, -2))
+
+
+def _diagonal(matrices: Array) -> Array:
+    """Return a view of the diagonals of contiguous matrices (..., n, n)."""
+    size = matrices.shape[-1]
+    return matrices.reshape(*matrices.shape[:-2], size * size)[..., :: size + 1]
 
 
 def _ground_force(tau: ArrayLike, rotation: Array, jacobians: Array) -> Array:

@@ -210,10 +210,8 @@ class FootForceFrozen(Guard):
             self._time[:] = 0.0
             return None
         is_same = data.state.foot_force == data.previous.foot_force
-        if not np.count_nonzero(is_same):  # often
-            self._time[:] = 0.0
-            return None
         self._time = np.where(is_same, self._time + data.gap, 0.0)
-        for i in np.flatnonzero(self._time > data.config.frozen_foot_time):
+        frozen = self._time > data.config.frozen_foot_time
+        for i in np.flatnonzero(frozen) if np.count_nonzero(frozen) else ():
             return f"the force of foot {LEGS[i]} has stayed at {data.state.foot_force[i]:.0f} N for {self._time[i]:.1f} s"
         return None

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from typing_extensions import override
 
 from quadvel_description.arrays import Array
+from quadvel_description.kinematics import rotate_one
 from quadvel_description.robot import GRAVITY
 
 from ..guard import MOVING_MODES, Guard, GuardInput, Level
@@ -116,7 +116,7 @@ class AccelerometerImplausible(Guard):
             return "the state's linear_acceleration is not finite"
         if not any(measured):
             return None
-        x, y, z = _rotate(data.state.quaternion.tolist(), measured)
+        x, y, z = rotate_one(data.state.quaternion.tolist(), measured)
         share = -math.expm1(-max(data.gap, 0.0) / ACCELERATION_WINDOW_S)
         a, b, c = self._mean
         self._mean = a + (x - a) * share, b + (y - b) * share, c + (z - GRAVITY - c) * share
@@ -124,17 +124,6 @@ class AccelerometerImplausible(Guard):
         if mean <= limit:
             return None
         return f"the accelerometer shows {mean:.1f} m/s^2 on the mean of half a second, limit {limit:.1f}"
-
-
-def _rotate(quaternion: Sequence[float], v: Sequence[float]) -> tuple[float, float, float]:
-    """Rotate a body vector to the world frame; faster than `kinematics.rotate` for one vector.
-
-    v' = v + w t + u x t  with  t = 2 u x v  for a quaternion (w, u)
-    """
-    w, x, y, z = quaternion
-    a, b, c = v
-    r, s, t = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
-    return a + w * r + y * t - z * s, b + w * s + z * r - x * t, c + w * t + x * s - y * r
 
 
 def _rotation_between(before: Array, after: Array) -> tuple[float, float, float]:
