@@ -130,6 +130,7 @@ LEFT_OUT = {
     "quadvel eval --grid quick --out out/eval": "minutes; tests/quadvel_eval/test_grid.py runs some of its walks",
     "quadvel eval --grid quick --policy NETWORK.onnx --out out/eval": "the same",
     "quadvel bench --out out/bench.json": "minutes, and only of use on an idle machine",
+    "quadvel bench --live": "a minute, and only of use on an idle machine",
     "quadvel paper --out docs/results/paper": "an hour; tests/quadvel_eval/test_paper_study.py runs parts of it",
     "quadvel paper --out out/ablation --policy rl_pd=a.onnx --policy crl_eam=b.onnx --only tracking --only gap": "the same",
     "quadvel paper --out out/ablation/paper --policy rl_pd=out/ablation/rl_pd/policy.onnx "

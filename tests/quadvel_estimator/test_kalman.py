@@ -143,7 +143,7 @@ def test_each_leg_tells_the_velocity_that_lets_its_contact_point_rest(standing: 
     dq, omega = rng.normal(size=12), rng.normal(size=3)
     attitude = Rotation.from_euler("ZYX", [1.0, 0.3, -0.2])
     state = standing(0.0, q=q, dq=dq, angular_velocity=omega, quaternion=attitude.as_quat(scalar_first=True))
-    velocity_by_leg = leg_velocity(state)
+    velocity_by_leg = leg_velocity(state, rotation_matrix(state.quaternion))
 
     def calf(q: np.ndarray, leg: int) -> Rotation:
         hip, thigh, knee = q[3 * leg : 3 * leg + 3]
@@ -202,6 +202,13 @@ def test_reset_forgets_one_robot_of_a_batch_and_keeps_the_others(trot: Trot) -> 
     assert covariance[1, 0, 0] > 2.0 * covariance[0, 0, 0]
     np.testing.assert_allclose(covariance[0], settled[0], rtol=0.1)
     np.testing.assert_allclose(velocity[:, 0], 0.8, atol=0.02)
+
+
+def test_a_series_ends_where_one_sample_after_the_other_ends(trot: Trot) -> None:
+    walk, estimator = trot(0.8, 30), KalmanEstimator(CONFIG)
+    for part in (walk[:10], walk[10:11], walk[11:]):
+        velocity, _ = estimator.update_series([state.time for state in part], stack(part))
+    np.testing.assert_allclose(velocity, run(KalmanEstimator(CONFIG), walk)[-1], atol=1e-9)
 
 
 def test_the_covariance_is_symmetric_and_grows_without_contact(standing: State) -> None:

@@ -25,6 +25,7 @@ from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand, Waiting
 from quadvel_msgs.srv import SetMode
+from quadvel_nodes.flat_messages import encode_low_state
 from quadvel_nodes.messages import write_low_state
 from quadvel_nodes.node import StartError
 from quadvel_nodes.scheduling import Scheduling
@@ -153,6 +154,8 @@ def test_a_command_starts_walking_once_the_operator_allows_it(
     robot.order(0.0)
     robot.step(5)
     robot.order(0.5)
+    robot.step(5)
+    robot.graph.node._report()  # once a second
     robot.step(5)
     report = robot.report("walk")
     assert report.mode == ControllerState.WALK
@@ -308,15 +311,16 @@ def test_states_that_do_not_come_after_a_stall_are_a_fault_a_period_later(robot:
     assert robot.report("fault").reason == "the state is 100 ms old, limit 50 ms"
 
 
-def unfit_states(robot: Robot) -> dict[str, Any]:
-    short = robot.message(tick=1)
-    short.q = np.zeros(11, np.float32)
-    quaternion = np.zeros(4)
+def unfit_states(robot: Robot) -> dict[str, bytes]:
+    def encoded(ahead: float = 0.0, **changes: Any) -> bytes:
+        stamp = robot.graph.stamp(ahead)
+        return encode_low_state((stamp.sec, stamp.nanosec), attrs.evolve(robot.state, tick=1, **changes))
+
     return {
-        "dq holds nan": robot.message(tick=1, dq=np.full(12, np.nan)),
-        "q has 11 numbers, expected 12": short,
-        "stamp is 1.000 s old": robot.message(-1.0, tick=1),
-        "orientation_wxyz has norm 0": robot.message(tick=1, quaternion=quaternion),
+        "dq holds nan": encoded(dq=np.full(12, np.nan)),
+        "message has 212 bytes, expected 50 numbers": encoded()[:-4],
+        "stamp is 1.000 s old": encoded(-1.0),
+        "orientation_wxyz has norm 0": encoded(quaternion=np.zeros(4)),
     }
 
 
@@ -324,14 +328,14 @@ def unfit_states(robot: Robot) -> dict[str, Any]:
     "what",
     [
         "dq holds nan",
-        "q has 11 numbers, expected 12",
+        "message has 212 bytes, expected 50 numbers",
         "stamp is 1.000 s old",
         "orientation_wxyz has norm 0",
     ],
 )
 def test_an_unfit_state_is_refused_counted_and_named_and_the_node_goes_on(robot: Robot, what: str) -> None:
     robot.stand()
-    robot.graph.node._on_state(unfit_states(robot)[what])  # as real rclpy hands it over: nothing is checked
+    robot.graph.node._on_state(unfit_states(robot)[what])  # which the middleware would drop, some of them
     assert robot.step().mode == MODE_SERVO
     assert all(answer.tick != 1 for answer in robot.answers)
     status = robot.graph.diagnosed(f"refused low_state: 1, last: {what}")

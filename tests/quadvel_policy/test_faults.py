@@ -20,7 +20,7 @@ from quadvel_policy.command_limits import LIMITS, JointCommandLimiter
 from quadvel_policy.faults import page, table
 from quadvel_policy.guard import Guard, Level
 from quadvel_policy.guards import GUARDS
-from quadvel_policy.guards.legs import EncoderInconsistent, ideal_torque
+from quadvel_policy.guards.legs import EncoderInconsistent
 from quadvel_policy.supervisor import SUPERVISOR_FAULTS
 from quadvel_policy.tick_input import MotorStatus, TickInput
 
@@ -47,7 +47,7 @@ class Backup:
     def reset(self) -> None:
         """Nothing to forget."""
 
-    def update(self, state: Any, previous_action: Any) -> tuple[np.ndarray, np.ndarray]:
+    def update_series(self, times: Any, states: Any) -> tuple[np.ndarray, np.ndarray]:
         if not np.isfinite(self.velocity).all():
             raise FloatingPointError("the filter has no velocity")
         return self.velocity, np.eye(3)
@@ -88,6 +88,11 @@ def giving_way(rig: Rig, joint: int, by: float, k: int) -> RobotState:
     noise = 1e-6 * (-1.0) ** k
     speed = by / 0.15 if share < 1.0 else 0.0
     return attrs.evolve(rig.state, q=rig.base + there * by * share + noise, dq=there * speed)
+
+
+def ideal_torque(command: JointCommand, state: RobotState) -> np.ndarray:
+    """What an ideal drive gives, N m."""
+    return np.clip(command.torque(state.q, state.dq), -TORQUE_LIMIT, TORQUE_LIMIT)
 
 
 def silent_drive(rig: Rig, k: int) -> Changes:

@@ -10,6 +10,7 @@ their user data; calls of others are ignored.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import socket
 import struct
@@ -18,6 +19,7 @@ from functools import cache
 from typing import Any
 
 from cyclonedds import builtin, core
+from cyclonedds._clayer import ddspy_take, ddspy_write
 from cyclonedds.core import DDSException, InstanceState
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
@@ -28,7 +30,7 @@ from cyclonedds.util import duration
 
 from quadvel_dds import idl, messages
 
-ANY = core.SampleState.Any | core.ViewState.Any | InstanceState.Any
+ANY = int(core.SampleState.Any | core.ViewState.Any | InstanceState.Any)
 REQUEST_HEADER = struct.Struct("<Qq")
 MAX_PARTICIPANTS = 32  # on one host, as rmw_cyclonedds sets it
 # Cyclone drops discovery data of other hosts on this interface; ROS 2 finds local nodes on it.
@@ -229,7 +231,6 @@ class Writer:
         self.dds = dds
         self.handle = dds.instance_handle % 2**64  # Cyclone's Python layer gives it a sign
         self.gid = dds.guid.bytes
-        self._sample: Any = dds.topic.data_type
 
     def write(self, data: bytes | bytearray) -> None:
         """Send a sample.
@@ -237,7 +238,9 @@ class Writer:
         Args:
             data: CDR bytes.
         """
-        self.dds.write(self._sample(data))
+        # Cyclone's Python writer would wrap the bytes in a sample and unwrap them.
+        if (code := ddspy_write(self.dds._ref, data.ljust(-(-len(data) // 4) * 4, b"\0"))) < 0:
+            raise DDSException(code, f"writing to {self.dds.topic.name}")
 
     def matched(self) -> list[Any]:
         """List the readers that receive the samples.
@@ -282,14 +285,6 @@ class Reader:
         self.gid = dds.guid.bytes
         self.is_closed = False
 
-    def has_data(self) -> bool:
-        """Return whether samples wait.
-
-        Returns:
-            Whether `take` may return a sample.
-        """
-        return not self.is_closed and self.condition.triggered
-
     def take(self) -> tuple[bytes, Any] | None:
         """Take the oldest sample.
 
@@ -297,12 +292,14 @@ class Reader:
             CDR bytes and Cyclone's sample info; None if no sample waits.
         """
         while not self.is_closed:
-            samples = self.dds.take(1)
+            samples = ddspy_take(self.dds._ref, ANY, 1)
+            if isinstance(samples, int):
+                raise DDSException(samples, f"reading from {self.dds.topic.name}")
             if not samples:
                 return None
-            info = samples[0].sample_info
+            data, info = samples[0]
             if info.valid_data:  # else: a writer has left, which ROS 2 does not report
-                return samples[0].data, info
+                return data, info
         return None
 
     def count(self) -> int:
@@ -365,16 +362,29 @@ class WaitSet:
         for reader in readers - self.readers:
             self.dds.attach(reader.condition)
         self.readers = readers
+        by_condition = {reader.condition: reader for reader in readers}
+        # Cyclone names a triggered condition by the address that it was attached with.
+        self._reader_at = {
+            ctypes.addressof(place): by_condition.get(condition) for condition, place in self.dds.attached
+        }
+        self._triggered = (ctypes.c_void_p * len(self._reader_at))()
 
-    def wait(self, timeout_ns: int) -> None:
+    def wait(self, timeout_ns: int) -> set[Reader | None]:
         """Wait until a reader has data, the timeout, or `wake`.
 
         Args:
             timeout_ns: Timeout, ns.
+
+        Returns:
+            Readers that have data; None among them if `wake` was called.
         """
-        with contextlib.suppress(DDSException):
-            self.dds.wait(timeout_ns)
-            self.guard.take()
+        places = self._triggered
+        count = self.dds._waitset_wait(self.dds._ref, places, len(places), timeout_ns)
+        found = {self._reader_at[place] for place in places[: max(count, 0)] if place}
+        if None in found:
+            with contextlib.suppress(DDSException):  # the participant has left
+                self.guard.take()
+        return found
 
     def wake(self) -> None:
         """End the present or the next wait; may be called from any thread."""

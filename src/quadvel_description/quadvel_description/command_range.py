@@ -45,7 +45,7 @@ def split_target(target: ArrayLike, kp: ArrayLike, q: ArrayLike) -> tuple[Array,
     torque: Array = kp * (target - sent)
     # tau = kp (target - clip(target)), bounded by the drive's limit; toward a mechanical stop it
     # decreases to zero over the last part: |tau| <= min(K_stop * distance, tau_max).
-    if torque.any():
+    if np.count_nonzero(torque):
         up = np.minimum(np.maximum(STOP_STIFFNESS_NM_PER_RAD * (UPPER - q), 0.0), TORQUE_LIMIT)
         down = np.minimum(np.maximum(STOP_STIFFNESS_NM_PER_RAD * (q - LOWER), 0.0), TORQUE_LIMIT)
         torque = np.minimum(np.maximum(torque, -down), up)

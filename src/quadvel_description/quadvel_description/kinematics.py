@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from .robot import CALF_LENGTH, FRONT, HIP_OFFSET, LEFT, LEGS, THIGH_LENGTH, THIGH_OFFSET
@@ -144,6 +146,24 @@ def rotate(quaternion: np.ndarray, v: np.ndarray) -> np.ndarray:
         Vectors in the world frame, (..., 3).
     """
     return (rotation_matrix(quaternion) @ np.asarray(v)[..., None])[..., 0]
+
+
+def rotate_one(quaternion: Sequence[float], v: Sequence[float]) -> tuple[float, float, float]:
+    """Rotate one body vector to the world frame; faster than `rotate`.
+
+        v' = v + w t + u x t  with  t = 2 u x v  for a quaternion (w, u)
+
+    Args:
+        quaternion: Orientation, body to world, (w, x, y, z).
+        v: Vector in the body frame.
+
+    Returns:
+        Vector in the world frame.
+    """
+    w, x, y, z = quaternion
+    a, b, c = v
+    r, s, t = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return a + w * r + y * t - z * s, b + w * s + z * r - x * t, c + w * t + x * s - y * r
 
 
 def rotate_inverse(quaternion: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -25,7 +25,8 @@ from std_srvs.srv import SetBool
 from quadvel_msgs.msg import LowCmd, LowState, MotorStatus
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
-from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
+from quadvel_nodes.flat_messages import decode_low_cmd, encode_low_state
+from quadvel_nodes.messages import Refusals
 from quadvel_nodes.node import read_parameters, request_exit, run
 from quadvel_nodes.robot_view import RobotView
 from quadvel_nodes.system_time import SystemTime
@@ -72,7 +73,7 @@ class Driver(Node):
         self._failure = ""
         self._set_mode = self.create_client(SetMode, "controller/set_mode")
         self._enable_walking = self.create_client(SetBool, "controller/enable_walking")
-        self.create_subscription(LowCmd, "low_cmd", self._on_command, 1)
+        self.create_subscription(LowCmd, "low_cmd", self._on_command, 1, raw=True)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if opened.dry_run:  # it may run next to a simulator, so it must not publish as a robot
             self.create_timer(1.0, partial(self._show, opened.dry_run), clock=steady)
@@ -119,9 +120,7 @@ class Driver(Node):
         robot = state.robot
         stamp = self._system_time.stamp(robot.time)
         if self._state_decimator.accepts(robot.tick):
-            message = LowState(stamp=stamp)
-            write_low_state(robot, message)
-            self._low_state.publish(message)
+            self._low_state.publish(encode_low_state((stamp.sec, stamp.nanosec), robot))
         if self._view_decimator.accepts(robot.tick):
             self._view.publish(stamp, robot)
         if self._motor_decimator.accepts(robot.tick):
@@ -129,9 +128,9 @@ class Driver(Node):
 
     # Methods of the executor's thread.
 
-    def _on_command(self, message: Any) -> None:
+    def _on_command(self, data: bytes) -> None:
         try:
-            self._link.submit(read_low_cmd(message))
+            self._link.submit(decode_low_cmd(data))
         except ValueError as error:
             self._refusals.add("low_cmd", error)
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import attrs
 import numpy as np
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
@@ -27,7 +28,8 @@ from quadvel_description.kinematics import rotate
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
-from quadvel_nodes.messages import MessageError, Refusals, read_low_state, read_numbers
+from quadvel_nodes.flat_messages import Stamp, decode_low_cmd, decode_low_state, encode_estimate
+from quadvel_nodes.messages import MessageError, Refusals
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transform_messages
 from quadvel_nodes.scheduling import Scheduling
@@ -100,8 +102,8 @@ class EstimatorNode(Node):
         self._tf = self.create_publisher(TFMessage, "/tf", 100)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # Subscribe to the command first: if both are pending, the command answers the previous state.
-        self.create_subscription(LowCmd, "low_cmd", self._on_command, qos_profile_sensor_data)
-        self.create_subscription(LowState, "low_state", self._on_state, qos_profile_sensor_data)
+        self.create_subscription(LowCmd, "low_cmd", self._on_command, qos_profile_sensor_data, raw=True)
+        self.create_subscription(LowState, "low_state", self._on_state, qos_profile_sensor_data, raw=True)
         self.create_service(Trigger, "~/reset_odometry", self._on_reset_odometry)
         self.create_timer(1.0, self._report)
         if not self.get_parameter(
@@ -110,18 +112,17 @@ class EstimatorNode(Node):
             self._settings.apply(self.get_logger().warning)
         gc.freeze()  # exclude existing objects from garbage collection, which would delay an estimate
 
-    def _on_command(self, message: Any) -> None:
+    def _on_command(self, data: bytes) -> None:
         try:
-            self._tracker.set_previous_action(
-                features.previous_action(read_numbers(message, "q", 12), message.mode)
-            )
+            command = decode_low_cmd(data)
+            self._tracker.set_previous_action(features.previous_action(command.q, command.mode))
         except MessageError as error:
             self._refusals.add("low_cmd", error)
 
-    def _on_state(self, message: Any) -> None:
+    def _on_state(self, data: bytes) -> None:
         start = perf_counter()
         try:
-            state = read_low_state(message)
+            stamp, state = decode_low_state(data)
             state.time = self._robot_time.update(state.time, state.tick)
             estimate = self._tracker.process(state)
         except (MessageError, FloatingPointError) as error:
@@ -129,11 +130,13 @@ class EstimatorNode(Node):
             return
         if estimate is None:
             return
-        self._publish_velocity(message.stamp, state, estimate)
+        self._publish_velocity(stamp, state, estimate)
         self._count += 1
         self._busy_s += perf_counter() - start
-        if self._count % ESTIMATES_PER_ODOMETRY == 0:
-            self._publish_odometry(message.stamp, state, estimate)
+        if self._count % ESTIMATES_PER_ODOMETRY == 0 and (
+            self._odom.get_subscription_count() or self._tf.get_subscription_count()
+        ):
+            self._publish_odometry(Time(sec=stamp[0], nanosec=stamp[1]), state, estimate)
 
     def _on_reset_odometry(self, request: Any, response: Any) -> Any:
         self._tracker.reset_position()
@@ -141,12 +144,10 @@ class EstimatorNode(Node):
         self.get_logger().info(response.message)
         return response
 
-    def _publish_velocity(self, stamp: Any, state: RobotState, estimate: Estimate) -> None:
-        message = TwistWithCovarianceStamped()
-        message.header.stamp = stamp
-        message.header.frame_id = self._settings.body_frame
-        _fill_twist(message.twist, state, estimate)
-        self._velocity.publish(message)
+    def _publish_velocity(self, stamp: Stamp, state: RobotState, estimate: Estimate) -> None:
+        covariance = _covariance(estimate.covariance, GYRO_VARIANCE)
+        velocities = estimate.velocity, state.angular_velocity
+        self._velocity.publish(encode_estimate(stamp, self._settings.body_frame, *velocities, covariance))
 
     def _publish_odometry(self, stamp: Any, state: RobotState, estimate: Estimate) -> None:
         """Publish x and y by dead reckoning and the orientation of the IMU; z is the height above the lowest foot."""
@@ -159,7 +160,9 @@ class EstimatorNode(Node):
         fill_vector(message.pose.pose.position, position)
         fill_quaternion(message.pose.pose.orientation, state.quaternion)
         message.pose.covariance = _covariance(np.diag(variances), ORIENTATION_VARIANCE)
-        _fill_twist(message.twist, state, estimate)
+        fill_vector(message.twist.twist.linear, estimate.velocity)
+        fill_vector(message.twist.twist.angular, state.angular_velocity)
+        message.twist.covariance = _covariance(estimate.covariance, GYRO_VARIANCE)
         self._odom.publish(message)
         if self._settings.publish_tf:
             frames = self._settings
@@ -198,13 +201,6 @@ class _ReportedCounts:
     count: int = 0
     refused: int = 0
     busy: float = 0.0
-
-
-def _fill_twist(twist: Any, state: RobotState, estimate: Estimate) -> None:
-    """Fill a TwistWithCovariance with the estimated linear and the measured angular velocity."""
-    fill_vector(twist.twist.linear, estimate.velocity)
-    fill_vector(twist.twist.angular, state.angular_velocity)
-    twist.covariance = _covariance(estimate.covariance, GYRO_VARIANCE)
 
 
 def _covariance(linear: Array, angular_variance: float) -> Array:

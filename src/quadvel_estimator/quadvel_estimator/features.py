@@ -42,24 +42,21 @@ DEFAULT_LAYOUT = InputLayout(
 KNOWN_INPUTS = {term.name: term.size for term in DEFAULT_LAYOUT.terms}
 
 
-def _gravity(state: RobotState, action: ArrayLike) -> ArrayLike:
-    return -rotation_matrix(state.quaternion)[..., 2, :]
+def _leg_velocity(state: RobotState, action: ArrayLike, rotation: Array) -> ArrayLike:
+    return leg_velocity(state, rotation).reshape(*np.shape(state.q)[:-1], 12)
 
 
-def _leg_velocity(state: RobotState, action: ArrayLike) -> ArrayLike:
-    return leg_velocity(state).reshape(*np.shape(state.q)[:-1], 12)
-
-
-_QUANTITIES: dict[str, Callable[[RobotState, ArrayLike], ArrayLike]] = {
-    "q": lambda state, action: state.q,
-    "dq": lambda state, action: state.dq,
-    "angular_velocity": lambda state, action: state.angular_velocity,
-    "linear_acceleration": lambda state, action: state.linear_acceleration,
-    "gravity": _gravity,
-    "previous_action": lambda state, action: action,
-    "torque": lambda state, action: state.tau,
+_QUANTITIES: dict[str, Callable[[RobotState, ArrayLike, Array], ArrayLike]] = {
+    "q": lambda state, action, rotation: state.q,
+    "dq": lambda state, action, rotation: state.dq,
+    "angular_velocity": lambda state, action, rotation: state.angular_velocity,
+    "linear_acceleration": lambda state, action, rotation: state.linear_acceleration,
+    "gravity": lambda state, action, rotation: -rotation[..., 2, :],
+    "previous_action": lambda state, action, rotation: action,
+    "torque": lambda state, action, rotation: state.tau,
     "leg_velocity": _leg_velocity,
 }
+"""Each quantity of a state, a previous action, and the rotation matrix from body to world."""
 
 
 def build(
@@ -78,7 +75,8 @@ def build(
     Returns:
         The input, (..., layout.size), float32; size 69 for the default layout.
     """
-    return layout.build({name: _QUANTITIES[name](state, previous_action) for name in layout.names})
+    rotation = rotation_matrix(state.quaternion)
+    return layout.build({name: _QUANTITIES[name](state, previous_action, rotation) for name in layout.names})
 
 
 def previous_action(q_target: ArrayLike, mode: int) -> Array:

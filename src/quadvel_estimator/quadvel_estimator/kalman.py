@@ -1,17 +1,20 @@
 """Contact-aided linear Kalman filter for the trunk velocity, from inertia and planted feet.
 
-The state has the 18 numbers of Bloesch et al. (2012, "State estimation for legged robots") and of
-the MIT Cheetah's estimator (Bledt et al. 2018), in the world frame: trunk position p, trunk
-velocity v, foot centres f_1..f_4. The orientation R (body to world) comes from the IMU.
+The filter is that of Bloesch et al. (2012, "State estimation for legged robots") and of the MIT
+Cheetah's estimator (Bledt et al. 2018), in the axes of the world. Their state holds the trunk's
+position p and the foot centres f_i. Legs measure only r_i = f_i - p, so the state here is the trunk
+velocity v and r_1..r_4, with the same result for v. The orientation R (body to world) comes from
+the IMU.
 
 All noise is isotropic. The axes x, y, z are then independent and share one covariance, which a
-rotation does not change. So the state x is an array (..., 6, 3) and the covariance P is (..., 6,
-6). The filter does not estimate the accelerometer bias; the legs bound its effect.
+rotation does not change. So the state x is an array (..., 5, 3) and the covariance P is (..., 5,
+5). The filter does not estimate the accelerometer bias; the legs bound its effect.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import attrs
@@ -26,18 +29,10 @@ from quadvel_description.state import RobotState
 
 from .odometry import foot_velocity_in_trunk, rolling_velocity
 
-VELOCITY_ROW = 1  # row of v in the state; row 0 is p, rows 2 to 5 are f_1..f_4
-FOOT_ROWS = slice(2, 6)
 SWING_SPEED_STD = 10.0  # m/s, standard deviation of the unknown speed of a foot in the air
 SPEED_CORRELATION_S = 1.0  # from the variance of a foot's speed to its random walk
-INITIAL_COVARIANCE = np.diag([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # m^2, (m/s)^2, 4 m^2
-# H, with z = H x: z_1..z_4 = f_i - p (feet relative to the trunk), z_5 = v.
-MEASUREMENT_MATRIX = np.zeros((5, 6))
-MEASUREMENT_MATRIX[:4, 0], MEASUREMENT_MATRIX[:4, FOOT_ROWS], MEASUREMENT_MATRIX[4, VELOCITY_ROW] = (
-    -1.0,
-    np.eye(4),
-    1.0,
-)
+INITIAL_COVARIANCE = np.eye(5)  # (m/s)^2, 4 m^2
+_IDENTITY = np.eye(3)
 
 
 @attrs.frozen
@@ -114,9 +109,10 @@ class KalmanEstimator:
             shape: Leading axes of all arrays; () for one robot.
         """
         self.config = config or KalmanConfig()
-        self._state = np.zeros((*shape, 6, 3))
-        self._covariance = np.zeros((*shape, 6, 6))
+        self._state = np.zeros((*shape, 5, 3))
+        self._covariance = np.zeros((*shape, 5, 5))
         self._speed_variance = np.zeros((*shape, 4))
+        self._transition, self._gain = np.eye(5), np.zeros(5)  # F and G of `_predict`
         self.reset()
 
     def reset(self, ids: Any = None) -> None:
@@ -148,27 +144,62 @@ class KalmanEstimator:
             ValueError: Time went back.
             FloatingPointError: The result is not finite.
         """
-        dt = 0.0 if self._time is None else state.time - self._time
-        if dt < 0.0:
-            raise ValueError(f"state.time is {state.time}, expected {self._time} or later, or a reset")
-        self._time = state.time
+        return self._process(state.time, *self._measure(state))
+
+    def update_series(self, times: Sequence[float], states: RobotState) -> tuple[Array, Array]:
+        """Process samples of one robot one after the other, faster than by `update`.
+
+        Args:
+            times: Times of the samples, s; at least one.
+            states: The samples, with a leading axis in all arrays, (n, ...).
+
+        Returns:
+            As `update`, at the last sample.
+
+        Raises:
+            ValueError: Time went back.
+            FloatingPointError: The result is not finite.
+        """
+        measured = self._measure(states)
+        for k, time in enumerate(times):
+            result = self._process(time, *(values[k] for values in measured))
+        return result
+
+    def _measure(self, state: RobotState) -> tuple[Array, ...]:
+        """Return what does not depend on the past.
+
+        These are the rotation R (..., 3, 3), and in the world's axes: feet relative to the trunk,
+        velocity of rolling feet, and the trunk's velocity from each leg (..., 4, 3), trust in the
+        contact of each foot (..., 4), and the trunk's acceleration (..., 3).
+        """
         rotation = rotation_matrix(state.quaternion)
         feet, jacobians = foot_kinematics(state.q)
         to_world = rotation.swapaxes(-1, -2)  # R^T, as vectors are rows: s_world = s_body R^T
         # With the foot s_i relative to the trunk, v = v_roll,i - d/dt (R s_i) for a planted foot.
-        foot_rolling = rolling_velocity(state, rotation) @ to_world
-        leg_velocity = foot_rolling - foot_velocity_in_trunk(state, feet, jacobians) @ to_world
+        rolling = rolling_velocity(state, rotation) @ to_world
+        leg_velocity = rolling - foot_velocity_in_trunk(state, feet, jacobians) @ to_world
         trust = self._contact_trust(state, rotation, jacobians)
+        acceleration = (rotation @ np.asarray(state.linear_acceleration)[..., None])[..., 0]
+        acceleration[..., 2] -= GRAVITY
+        return rotation, feet @ to_world, rolling, leg_velocity, trust, acceleration
 
-        self._predict(state, rotation, dt)
+    def _process(
+        self, time: float, rotation: Array, feet: Array, rolling: Array, leg_velocity: Array, trust: Array,
+        acceleration: Array,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Process the results of `_measure` at a time, s; returns what `update` returns."""
+        dt = 0.0 if self._time is None else time - self._time
+        if dt < 0.0:
+            raise ValueError(f"state.time is {time}, expected {self._time} or later, or a reset")
+        self._time = time
+        self._predict(acceleration, dt)
         speed_variance = self._foot_speed_variance(leg_velocity, trust)
-        self._predict_feet(foot_rolling, speed_variance, dt)
-        self._correct(feet @ to_world, leg_velocity, speed_variance)
-
-        velocity = (self._state[..., VELOCITY_ROW : VELOCITY_ROW + 1, :] @ rotation)[..., 0, :]
+        self._predict_feet(rolling, speed_variance, dt)
+        self._correct(feet, leg_velocity, speed_variance)
+        velocity = (self._state[..., :1, :] @ rotation)[..., 0, :]
         if not np.isfinite(velocity).all():
             raise FloatingPointError("the Kalman filter's velocity is not finite")
-        return velocity, self._covariance[..., VELOCITY_ROW, VELOCITY_ROW, None, None] * np.eye(3)
+        return velocity, self._covariance[..., 0, 0, None, None] * _IDENTITY
 
     def _contact_trust(self, state: RobotState, rotation: Array, jacobians: Array) -> Array:
         """Return the contact confidence of each foot, (..., 4): 0 in the air, 1 planted, linear in the force."""
@@ -178,19 +209,15 @@ class KalmanEstimator:
             force = _ground_force(state.tau, rotation, jacobians)
         return np.clip((force - self.config.contact_force) / self.config.contact_ramp, 0.0, 1.0)
 
-    def _predict(self, state: RobotState, rotation: Array, dt: float) -> None:
-        """Predict position and velocity over `dt` (s).
+    def _predict(self, acceleration: Array, dt: float) -> None:
+        """Predict the velocity and the feet relative to the trunk over `dt` (s).
 
-        a = R a_measured - g e_z
-        p' = p + v dt + a dt^2 / 2,   v' = v + a dt
-        P' = F P F^T + sigma_a^2 G G^T,   G = (dt^2 / 2, dt, 0, 0, 0, 0)
+        v' = v + a dt,   r_i' = r_i - v dt - a dt^2 / 2
+        P' = F P F^T + sigma_a^2 G G^T,   G = (dt, -dt^2 / 2, ..., -dt^2 / 2)
         """
-        gain = np.array([0.5 * dt * dt, dt, 0.0, 0.0, 0.0, 0.0])
-        transition = np.eye(6)
-        transition[0, VELOCITY_ROW] = dt
-        acceleration = rotation @ np.asarray(state.linear_acceleration)[..., None]
-        acceleration[..., 2, 0] -= GRAVITY
-        self._state = transition @ self._state + gain[:, None] * acceleration.swapaxes(-1, -2)
+        gain, transition = self._gain, self._transition
+        gain[0], gain[1:], transition[1:, 0] = dt, -0.5 * dt * dt, -dt
+        self._state = transition @ self._state + gain[:, None] * acceleration[..., None, :]
         noise = gain[:, None] * gain * self.config.accelerometer**2
         self._covariance = transition @ self._covariance @ transition.T + noise
 
@@ -201,10 +228,8 @@ class KalmanEstimator:
         e = |v_leg - v|^2 / (3 gate^2 sigma^2)   (excess over the slip gate)
         result = sigma^2 max(e^2 - 1, 0) + (1 - trust) SWING_SPEED_STD^2
         """
-        expected_variance = (
-            self._covariance[..., VELOCITY_ROW, VELOCITY_ROW, None] + self.config.foot_velocity**2
-        )
-        deviation = np.square(leg_velocity - self._state[..., VELOCITY_ROW, None, :]).sum(-1) / 3.0
+        expected_variance = self._covariance[..., 0, 0, None] + self.config.foot_velocity**2
+        deviation = np.square(leg_velocity - self._state[..., :1, :]).sum(-1) / 3.0
         excess = deviation / (self.config.slip_gate**2 * expected_variance)
         slip: Array = expected_variance * np.maximum(excess**2 - 1.0, 0.0)
         return slip + (1.0 - trust) * SWING_SPEED_STD**2
@@ -212,41 +237,44 @@ class KalmanEstimator:
     def _predict_feet(self, rolling: Array, speed_variance: Array, dt: float) -> None:
         """Move the feet by rolling and add their random walk over `dt` (s).
 
-            f_i' = f_i + v_roll,i dt
+            r_i' = r_i + v_roll,i dt
             P_ii' = P_ii + (sigma_walk^2 + max(s_i before, s_i now) SPEED_CORRELATION_S) dt
 
         The larger of the two speed variances counts: only a foot that is planted at both ends of
         `dt` stayed in place in between.
         """
-        self._state[..., FOOT_ROWS, :] += rolling * dt
+        self._state[..., 1:, :] += rolling * dt
         before, self._speed_variance = self._speed_variance, speed_variance
         walk = self.config.foot_walk**2 + np.maximum(before, speed_variance) * SPEED_CORRELATION_S
-        diagonal = np.einsum("...ii->...i", self._covariance)  # a view
-        diagonal[..., FOOT_ROWS] += walk * dt
+        _diagonal(self._covariance)[..., 1:] += walk * dt
 
     def _correct(self, feet: Array, leg_velocity: Array, speed_variance: Array) -> None:
-        """Correct with the feet (z_1..z_4) and the trunk velocity from the legs (z_5).
+        """Correct with the trunk velocity from the legs (z_0) and the feet (z_1..z_4).
 
         The four leg velocities enter as their weighted mean, w_i = 1 / (sigma_foot^2 + s_i), which
-        is equivalent to four measurements:
+        is equivalent to four measurements. The measurement is that of the whole state, H = I:
 
-            S = H P H^T + R,   K = P H^T S^-1
-            x' = x + K (z - H x),   P' = P - K H P
+            S = P + R,   K = P S^-1
+            x' = x + K (z - x),   P' = P - K P
         """
         weight = 1.0 / (self.config.foot_velocity**2 + speed_variance)
         total = weight.sum(-1, keepdims=True)
         mean = (weight[..., None, :] @ leg_velocity) / total[..., None]
 
-        measured = MEASUREMENT_MATRIX @ self._covariance  # (..., 5, 6)
-        innovation_covariance = measured @ MEASUREMENT_MATRIX.T
-        diagonal = np.einsum("...ii->...i", innovation_covariance)  # a view
-        diagonal[..., :4] += self.config.foot_position**2
-        diagonal[..., 4:] += 1.0 / total
-        gain = np.linalg.solve(innovation_covariance, measured).swapaxes(-1, -2)
-        innovation = np.concatenate([feet, mean], axis=-2) - MEASUREMENT_MATRIX @ self._state
-        self._state = self._state + gain @ innovation
-        covariance = self._covariance - gain @ measured
+        innovation_covariance = self._covariance.copy()
+        diagonal = _diagonal(innovation_covariance)
+        diagonal[..., :1] += 1.0 / total
+        diagonal[..., 1:] += self.config.foot_position**2
+        gain = np.linalg.solve(innovation_covariance, self._covariance).swapaxes(-1, -2)
+        self._state = self._state + gain @ (np.concatenate([mean, feet], axis=-2) - self._state)
+        covariance = self._covariance - gain @ self._covariance
         self._covariance = 0.5 * (covariance + covariance.swapaxes(-1, -2))
+
+
+def _diagonal(matrices: Array) -> Array:
+    """Return a view of the diagonals of contiguous matrices (..., n, n)."""
+    size = matrices.shape[-1]
+    return matrices.reshape(*matrices.shape[:-2], size * size)[..., :: size + 1]
 
 
 def _ground_force(tau: ArrayLike, rotation: Array, jacobians: Array) -> Array:

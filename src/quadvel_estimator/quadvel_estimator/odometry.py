@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from quadvel_description.arrays import Array
-from quadvel_description.kinematics import foot_kinematics, rotation_matrix
+from quadvel_description.kinematics import foot_kinematics
 from quadvel_description.robot import FOOT_RADIUS
 from quadvel_description.state import RobotState
 
@@ -17,20 +17,19 @@ from quadvel_description.state import RobotState
 CROSS_PRODUCT_TENSOR = np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)
 
 
-def leg_velocity(state: RobotState) -> Array:
+def leg_velocity(state: RobotState, rotation: Array) -> Array:
     """Compute the velocity of the trunk's origin from each leg, as if its foot were planted.
 
         v = v_roll - (w x s + J dq)
 
     Args:
         state: The measured state, arrays (..., 12), (..., 4), (..., 3).
+        rotation: Rotation matrix from body to world, (..., 3, 3).
 
     Returns:
         Velocity in the body frame, (..., 4, 3), m/s.
     """
-    return rolling_velocity(state, rotation_matrix(state.quaternion)) - foot_velocity_in_trunk(
-        state, *foot_kinematics(state.q)
-    )
+    return rolling_velocity(state, rotation) - foot_velocity_in_trunk(state, *foot_kinematics(state.q))
 
 
 def rolling_velocity(state: RobotState, rotation: Array) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadvel_description.arrays import Array
-from quadvel_description.kinematics import rotate
+from quadvel_description.kinematics import rotate_one
 from quadvel_description.state import RobotState
 from quadvel_nodes.messages import MessageError
 from quadvel_nodes.tick_grid import TickGrid
@@ -124,7 +124,9 @@ class VelocityTracker:
             raise
         dt = 0.0 if self._last_estimated is None else state.time - self._last_estimated
         self._last_estimated = state.time
-        self._position = self._position + dt * rotate(state.quaternion, velocity)
+        self._position = self._position + dt * np.array(
+            rotate_one(state.quaternion.tolist(), velocity.tolist())
+        )
         self._deviation = self._deviation + dt * np.sqrt(covariance.diagonal())
         return Estimate(velocity, covariance, self._position, self._deviation)
 

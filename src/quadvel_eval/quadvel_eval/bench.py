@@ -1,6 +1,7 @@
 """Benchmarks the speed of simulator, networks and transport (`quadvel bench`).
 
-Other packages add parts by entry points of the group `quadvel.benchmarks`, each naming a `Benchmark`.
+Other packages add parts by entry points of the group `quadvel.benchmarks`, each naming a `Benchmark`,
+and parts that start nodes by those of the group `quadvel.live_benchmarks` (`quadvel bench --live`).
 
 One run measures everything, so that ratios hold where absolute figures vary between machines.
 Times are medians, which ignore interruptions by other programs.
@@ -43,6 +44,8 @@ WALK_COMMAND = (0.5, 0.0, 0.0)
 SCHEMA = 1
 GROUP = "quadvel.benchmarks"
 """Entry points of other packages, each naming a `Benchmark`."""
+LIVE_GROUP = "quadvel.live_benchmarks"
+"""Entry points that name a function: duration (s) and number of busy processes to a `Benchmark`."""
 
 
 @attrs.frozen
@@ -327,6 +330,19 @@ def all_parts() -> dict[str, Benchmark]:
         Benchmarks by part; one that cannot be loaded reports why it is skipped.
     """
     return PARTS | {entry.name: _load(entry) for entry in metadata.entry_points(group=GROUP)}
+
+
+def live_parts(seconds: float, busy: int) -> dict[str, Benchmark]:
+    """List the benchmarks of running nodes.
+
+    Args:
+        seconds: Duration of each, s.
+        busy: Number of other processes that compute without a pause.
+
+    Returns:
+        Benchmarks by part.
+    """
+    return {entry.name: entry.load()(seconds, busy) for entry in metadata.entry_points(group=LIVE_GROUP)}
 
 
 def _load(entry: metadata.EntryPoint) -> Benchmark:

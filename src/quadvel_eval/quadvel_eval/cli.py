@@ -146,13 +146,20 @@ def bench_command(
     out: Annotated[Path, typer.Option(metavar="<file>", help="JSON file for the figures.")] = Path(
         "out/bench.json"
     ),
+    live: Annotated[
+        bool, typer.Option("--live", help="Measure the running nodes of a walking robot instead.")
+    ] = False,
+    seconds: Annotated[float, typer.Option(min=1.0, metavar="<s>", help="Duration of --live, s.")] = 60.0,
+    busy: Annotated[
+        int, typer.Option(min=0, metavar="<n>", help="Programs that compute without a pause beside --live.")
+    ] = 0,
 ) -> None:
     """Measure how fast this machine simulates, infers, communicates and trains.
 
     It takes some minutes. Run it on an idle machine.
     """
     output_file(out)
-    parts, results = bench.all_parts(), {}
+    parts, results = bench.live_parts(seconds, busy) if live else bench.all_parts(), {}
     messages = Console(stderr=True)
     with messages.status("") as status:
         for name, part in parts.items():

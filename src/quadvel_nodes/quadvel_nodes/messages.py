@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -79,30 +79,62 @@ def read_numbers(message: Any, field: str, size: int) -> Array:
     value = np.array(getattr(message, field), np.float64)
     if value.shape != (size,):
         raise MessageError(f"{field} has {value.size} numbers, expected {size}")
-    if not np.isfinite(value).all():
-        raise NotFiniteError(f"{field} holds {value[~np.isfinite(value)][0]}, expected finite numbers")
+    _require_finite(field, value)
     return value
 
 
-class _NumericFields:
-    """Reads all numeric fields of a message at once, which is faster than one by one at 200 Hz."""
+def _require_finite(field: str, value: Array) -> None:
+    if not np.isfinite(value).all():
+        raise NotFiniteError(f"{field} holds {value[~np.isfinite(value)][0]}, expected finite numbers")
+
+
+class NumericFields:
+    """Numeric fields of a message as one block, which is faster than one by one at 200 Hz."""
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         self._fields, self._sizes = tuple(sizes), list(sizes.values())
         self._slices = [slice(*ends) for ends in pairwise(accumulate(self._sizes, initial=0))]
 
     def read(self, message: Any) -> list[Array]:
-        """Return the array of each field; raise MessageError as `numbers` does."""
+        """Read all fields of a message.
+
+        Args:
+            message: The message.
+
+        Returns:
+            The array of each field.
+
+        Raises:
+            MessageError: A field has another length.
+            NotFiniteError: A number is NaN or infinite.
+        """
         values = [getattr(message, field) for field in self._fields]
-        block = np.concatenate(values, dtype=np.float64)
-        # np.count_nonzero is faster than np.all for short arrays.
-        if list(map(len, values)) != self._sizes or np.count_nonzero(np.isfinite(block)) < len(block):
+        if list(map(len, values)) != self._sizes:
             for field, size in zip(self._fields, self._sizes, strict=True):
                 read_numbers(message, field, size)
-        return [block[part] for part in self._slices]
+        return self.split(np.concatenate(values, dtype=np.float64))
+
+    def split(self, block: Array) -> list[Array]:
+        """Split the numbers of all fields.
+
+        Args:
+            block: The numbers, in the order of the fields.
+
+        Returns:
+            The array of each field, a view.
+
+        Raises:
+            NotFiniteError: A number is NaN or infinite.
+        """
+        arrays = [block[part] for part in self._slices]
+        # np.count_nonzero is faster than np.all for short arrays.
+        if np.count_nonzero(np.isfinite(block)) < len(block):
+            for field, value in zip(self._fields, arrays, strict=True):
+                _require_finite(field, value)
+        return arrays
 
 
-_LOW_STATE_FIELDS, _LOW_CMD_FIELDS = _NumericFields(LOW_STATE_SIZES), _NumericFields(LOW_CMD_SIZES)
+_LOW_STATE_FIELDS, _LOW_CMD_FIELDS = NumericFields(LOW_STATE_SIZES), NumericFields(LOW_CMD_SIZES)
 
 
 def read_low_state(message: Any) -> RobotState:
@@ -119,22 +151,29 @@ def read_low_state(message: Any) -> RobotState:
         NotFiniteError: A number is NaN or infinite.
         NotUnitError: The norm of the quaternion is not 1 within QUATERNION_TOLERANCE.
     """
-    q, dq, tau, quaternion, angular_velocity, linear_acceleration, foot_force = _LOW_STATE_FIELDS.read(
-        message
-    )
+    return robot_state(seconds(message.stamp), message.tick, _LOW_STATE_FIELDS.read(message))
+
+
+def robot_state(time: float, tick: int, fields: Sequence[Array]) -> RobotState:
+    """Make a RobotState from the fields of a LowState and normalise its quaternion.
+
+    Args:
+        time: Stamp of the message, s.
+        tick: Its tick.
+        fields: Its numeric fields, in the order of LOW_STATE_SIZES.
+
+    Returns:
+        The state.
+
+    Raises:
+        NotUnitError: The norm of the quaternion is not 1 within QUATERNION_TOLERANCE.
+    """
+    q, dq, tau, quaternion, angular_velocity, linear_acceleration, foot_force = fields
     norm = math.hypot(*quaternion.tolist())
     if abs(norm - 1.0) > QUATERNION_TOLERANCE:
         raise NotUnitError(f"orientation_wxyz has norm {norm:.3g}, expected a unit quaternion")
     return RobotState(
-        time=seconds(message.stamp),
-        tick=message.tick,
-        q=q,
-        dq=dq,
-        tau=tau,
-        quaternion=quaternion / norm,
-        angular_velocity=angular_velocity,
-        linear_acceleration=linear_acceleration,
-        foot_force=foot_force,
+        time, tick, q, dq, tau, quaternion / norm, angular_velocity, linear_acceleration, foot_force
     )
 
 

@@ -56,25 +56,28 @@ class RobotView:
         self._latched[1].publish(String(data=urdf()))
 
     def publish(self, stamp: Any, state: RobotState) -> None:
-        """Publish one state.
+        """Publish one state on the topics to which somebody subscribes.
 
         Args:
             stamp: Time of the state, a builtin_interfaces/Time.
             state: The state.
         """
-        joints = JointState(name=list(robot.JOINT_NAMES))
-        joints.header.stamp = stamp
-        joints.position, joints.velocity = state.q.tolist(), state.dq.tolist()
-        joints.effort = state.tau.tolist()
-        self._joint_states.publish(joints)
-        self._tf.publish(TFMessage(transforms=transform_messages(stamp, moving_links(state.q))))
-        imu = self._noise
-        imu.header.stamp = stamp
-        imu.header.frame_id = IMU
-        fill_quaternion(imu.orientation, state.quaternion)
-        fill_vector(imu.angular_velocity, state.angular_velocity)
-        fill_vector(imu.linear_acceleration, state.linear_acceleration)
-        self._imu.publish(imu)
+        if self._joint_states.get_subscription_count():
+            joints = JointState(name=list(robot.JOINT_NAMES))
+            joints.header.stamp = stamp
+            joints.position, joints.velocity = state.q.tolist(), state.dq.tolist()
+            joints.effort = state.tau.tolist()
+            self._joint_states.publish(joints)
+        if self._tf.get_subscription_count():
+            self._tf.publish(TFMessage(transforms=transform_messages(stamp, moving_links(state.q))))
+        if self._imu.get_subscription_count():
+            imu = self._noise
+            imu.header.stamp = stamp
+            imu.header.frame_id = IMU
+            fill_quaternion(imu.orientation, state.quaternion)
+            fill_vector(imu.angular_velocity, state.angular_velocity)
+            fill_vector(imu.linear_acceleration, state.linear_acceleration)
+            self._imu.publish(imu)
 
 
 def transform_messages(stamp: Any, placed: Sequence[FramePose]) -> list[Any]:

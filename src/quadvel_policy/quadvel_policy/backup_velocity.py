@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+import math
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike
 
 from quadvel_description.arrays import Array
 from quadvel_description.kinematics import rotate_inverse
@@ -17,21 +18,27 @@ REST_ACCELERATION = np.array([0.0, 0.0, GRAVITY])
 """Reading of an accelerometer at rest, world frame, m/s^2."""
 
 
+BATCH = 4
+"""States that wait for the filter while nobody needs its velocity: 20 ms."""
+_ARRAYS = [field.name for field in attrs.fields(RobotState) if field.name not in ("time", "tick")]
+
+
 class Estimator(Protocol):
     """Interface of a velocity filter, such as `quadvel_estimator.kalman.KalmanEstimator`."""
 
     def reset(self) -> None:
         """Reset the filter."""
 
-    def update(self, state: RobotState, previous_action: ArrayLike) -> tuple[Array, Array]:
-        """Process one sample.
+    def update_series(self, times: Sequence[float], states: RobotState) -> tuple[Array, Array]:
+        """Process samples one after the other.
 
         Args:
-            state: The measured state.
-            previous_action: Not used by the Kalman filter.
+            times: Times of the samples, s.
+            states: The samples, with a leading axis in all arrays, (n, ...).
 
         Returns:
-            Velocity of the trunk, body frame, (3,), m/s, and its covariance, (3, 3), (m/s)^2.
+            Velocity of the trunk at the last sample, body frame, (3,), m/s, and its covariance, (3,
+            3), (m/s)^2.
         """
 
 
@@ -42,32 +49,69 @@ class BackupVelocity:
     the accelerometer. The legs alone give the velocity to within 0.02 m/s of the result with an
     accelerometer.
 
+    The filter sees every state. While its velocity only confirms the estimate, it processes BATCH
+    states at once, which costs half as much. As soon as the velocity matters, it catches up.
+
     Attributes:
-        velocity: Velocity at the newest state, body frame, (3,), m/s; None if there is none.
+        velocity: Velocity at the newest processed state, body frame, (3,), m/s; None if there is
+            none.
     """
 
     def __init__(self, filter: Estimator | None) -> None:
         self._filter = filter
+        self._waiting: list[RobotState] = []
+        self._is_needed = False
         self.velocity: Array | None = None
 
-    def update(self, state: RobotState) -> None:
-        """Process the next state; if the filter fails, reset it, without a velocity until the next state.
+    def add(self, state: RobotState) -> None:
+        """Take the next state.
 
         Args:
             state: The measured state.
         """
-        if self._filter is None:
+        self._waiting.append(state)
+        if self._is_needed or self.velocity is None or len(self._waiting) == BATCH:
+            self._catch_up()
+
+    def confirm(self, estimate: Array | None, tolerance: float) -> None:
+        """Make `velocity` that of the newest state, unless it confirms an estimate anyway.
+
+        Args:
+            estimate: The velocity estimate, body frame, (3,), m/s; None if there is none.
+            tolerance: Largest difference at which the estimate is confirmed, m/s.
+        """
+        self._is_needed = (
+            estimate is None
+            or self.velocity is None
+            or not math.dist(estimate.tolist(), self.velocity.tolist()) <= tolerance
+        )
+        if self._is_needed:
+            self._catch_up()
+
+    def newest(self) -> Array | None:
+        """Return the velocity at the newest state, because it is used."""
+        self._is_needed = True
+        self._catch_up()
+        return self.velocity
+
+    def _catch_up(self) -> None:
+        """Process the waiting states; if the filter fails, reset it, without a velocity until the next state."""
+        waiting, self._waiting = self._waiting, []
+        if self._filter is None or not waiting:
             return
+        arrays: dict[str, Any] = {
+            name: np.array([getattr(state, name) for state in waiting]) for name in _ARRAYS
+        }
+        states = attrs.evolve(waiting[0], **arrays)
+        states.linear_acceleration = rotate_inverse(states.quaternion, REST_ACCELERATION)
         try:
-            at_rest = rotate_inverse(state.quaternion, REST_ACCELERATION)
-            self.velocity, _ = self._filter.update(
-                attrs.evolve(state, linear_acceleration=at_rest), np.zeros(12)
-            )
+            self.velocity, _ = self._filter.update_series([state.time for state in waiting], states)
         except (ValueError, FloatingPointError, np.linalg.LinAlgError):
             self.reset()
 
     def reset(self) -> None:
         """Reset the filter; there is no velocity until the next state."""
+        self._waiting.clear()
         if self._filter is not None:
             self._filter.reset()
         self.velocity = None

@@ -54,22 +54,22 @@ class JointCommandLimiter:
         self._config = config
         self.counts: Counter[str] = Counter()
 
-    def apply(self, command: JointCommand, previous: JointCommand, state: RobotState) -> None:
+    def apply(self, command: JointCommand, before: Array, state: RobotState) -> None:
         """Limit a command in place.
 
         Args:
             command: The command that answers `state`; changed in place.
-            previous: The command of the previous tick.
+            before: Torque that the command of the previous tick asks for at `state`, (12,), N m.
             state: The measured state.
         """
         if command.mode == MODE_DAMPING:
             return
-        beyond = (command.q != clip_to_command_range(command.q)).any()
-        command.q, torque = split_target(command.q, command.kp, state.q)
+        target = command.q
+        command.q, torque = split_target(target, command.kp, state.q)
         command.tau = command.tau + torque
-        self._count("target_out_of_range", beyond)
+        self._count("target_out_of_range", np.count_nonzero(command.q != target) > 0)
         requested = command.torque(state.q, state.dq)
-        allowed = self._limit_step(requested, previous.torque(state.q, state.dq))
+        allowed = self._limit_step(requested, before)
         allowed = self._limit_torque(allowed)
         allowed = self._limit_at_top_speed(allowed, state.dq)
         allowed = self._limit_power(allowed, state.dq)
@@ -92,8 +92,10 @@ class JointCommandLimiter:
         return held_torque
 
     def _limit_at_top_speed(self, torque: Array, speed: Array) -> Array:
-        faster = (np.abs(speed) >= VELOCITY_LIMIT) & (torque * speed > 0.0)
-        if not np.count_nonzero(faster):
+        at_limit = np.abs(speed) >= VELOCITY_LIMIT
+        if not np.count_nonzero(at_limit) or not np.count_nonzero(
+            faster := at_limit & (torque * speed > 0.0)
+        ):
             return torque
         self._count("joint_at_speed_limit", True)
         return np.where(faster, 0.0, torque)

@@ -18,6 +18,7 @@ from quadvel_description.arrays import Array
 MAX_RAMP_STEP_S = 0.05
 """Largest time step of the ramp, so that the command does not jump after a stall."""
 Axes = tuple[float, float, float]
+ZERO: Axes = (0.0, 0.0, 0.0)
 
 
 @attrs.frozen
@@ -106,8 +107,8 @@ class CommandMux:
                 raise ValueError(f"inputs have the {field} list {values}, expected each {field} once")
         self._inputs = sorted(inputs, key=lambda i: -i.priority)
         self._config = config
-        self._received: dict[str, tuple[float, Array]] = {}
-        self._velocity = np.zeros(3)
+        self._received: dict[str, tuple[float, Axes]] = {}
+        self._velocity = ZERO
         self._updated: float | None = None
         self.locks: set[str] = set()
         self.stance_requested = False
@@ -123,10 +124,10 @@ class CommandMux:
         Raises:
             ValueError: A number is not finite.
         """
-        value = np.array(velocity, float)
-        if not np.isfinite(value).all():
-            raise ValueError(f"{name}: the velocity is {value.tolist()}, expected finite numbers")
-        self._received[name] = (now, value)
+        vx, vy, wz = np.asarray(velocity, float).tolist()
+        if not all(map(math.isfinite, (vx, vy, wz))):
+            raise ValueError(f"{name}: the velocity is {[vx, vy, wz]}, expected finite numbers")
+        self._received[name] = (now, (vx, vy, wz))
 
     def update(self, now: float) -> MuxOutput:
         """Compute the command: the active velocity, at most one ramp step from the last command.
@@ -141,16 +142,14 @@ class CommandMux:
         self._received = {name: entry for name, entry in self._received.items() if entry[0] <= now}
         source = self._active_input(now)
         if source is None or self.locks or self.stance_requested:
-            source, target = None, np.zeros(3)
+            source, target = None, ZERO
         else:
             target = self._target(self._received[source.name][1])
         elapsed = 0.0 if self._updated is None else min(max(now - self._updated, 0.0), MAX_RAMP_STEP_S)
         self._updated = now
-        slower = np.abs(target) < np.abs(self._velocity)
-        limit = np.where(slower, self._config.stop_acceleration, self._config.acceleration)
-        self._velocity = self._ramp(target, limit * elapsed)
-        stance = not target.any() and not self._velocity.any()
-        return MuxOutput(self._velocity.copy(), stance, source.name if source else "none")
+        self._velocity = self._ramp(target, elapsed)
+        stance = not any(target) and not any(self._velocity)
+        return MuxOutput(np.array(self._velocity), stance, source.name if source else "none")
 
     def _active_input(self, now: float) -> MuxInput | None:
         """Return the active source with the highest priority, or None."""
@@ -159,17 +158,23 @@ class CommandMux:
                 return source
         return None
 
-    def _target(self, velocity: Array) -> Array:
+    def _target(self, velocity: Axes) -> Axes:
         c = self._config
-        if (np.abs(velocity) < c.dead_zone).all():
-            return np.zeros(3)
-        return np.clip(velocity, np.negative(c.max_velocity), c.max_velocity)
+        if all(abs(v) < zone for v, zone in zip(velocity, c.dead_zone, strict=True)):
+            return ZERO
+        vx, vy, wz = (min(max(v, -most), most) for v, most in zip(velocity, c.max_velocity, strict=True))
+        return vx, vy, wz
 
-    def _ramp(self, target: Array, step: Array) -> Array:
-        """Move straight towards `target` by at most `step` on each axis."""
-        difference = target - self._velocity
-        if (np.abs(difference) <= step).all():
+    def _ramp(self, target: Axes, elapsed: float) -> Axes:
+        """Move straight towards `target` by at most what each axis may change in `elapsed` (s)."""
+        c, now = self._config, self._velocity
+        rates = zip(target, now, c.stop_acceleration, c.acceleration, strict=True)
+        steps = [(stop if abs(t) < abs(v) else start) * elapsed for t, v, stop, start in rates]
+        differences = [t - v for t, v in zip(target, now, strict=True)]
+        if all(abs(d) <= step for d, step in zip(differences, steps, strict=True)):
             return target
-        if not step.all():  # no time has passed
-            return self._velocity
-        return self._velocity + difference / np.max(np.abs(difference) / step)
+        if not all(steps):  # no time has passed
+            return now
+        most = max(abs(d) / step for d, step in zip(differences, steps, strict=True))
+        vx, vy, wz = (v + d / most for v, d in zip(now, differences, strict=True))
+        return vx, vy, wz

@@ -77,6 +77,7 @@ class CommandMuxNode(Node):
         self._mux = CommandMux(inputs, settings)
         self._refusals, self._refused_before = Refusals(), 0
         self._output: MuxOutput | None = None
+        self._message = VelocityCommand()
         kind = TwistStamped if settings.stamped else Twist
         for source, topic in zip(inputs, settings.topics, strict=True):
             check = StampCheck(source.timeout) if settings.stamped else None
@@ -120,10 +121,9 @@ class CommandMuxNode(Node):
         self._output = output
         if before is not None and output.source != before.source:
             self._log_source(output.source)
-        message = VelocityCommand(
-            stamp=self.get_clock().now().to_msg(), stance=output.stance, source=output.source
-        )
-        twist = message.twist
+        message, twist = self._message, self._message.twist
+        message.stamp = self.get_clock().now().to_msg()
+        message.stance, message.source = output.stance, output.source
         twist.linear.x, twist.linear.y, twist.angular.z = output.velocity.tolist()
         self._command.publish(message)
 

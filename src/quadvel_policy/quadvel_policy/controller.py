@@ -24,22 +24,17 @@ from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand, Waiting
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
-from quadvel_nodes.messages import (
-    MessageError,
-    Refusals,
-    read_low_state,
-    read_numbers,
-    seconds,
-    write_low_cmd,
-)
+from quadvel_nodes.flat_messages import decode_estimate, decode_low_state, encode_low_cmd
+from quadvel_nodes.messages import MessageError, Refusals, read_numbers, seconds
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.number_text import number_text
 from quadvel_nodes.scheduling import Scheduling
 
 from .control_loop import WATCH_PERIOD_S, ControlConfig, ControlLoop
+from .loop_stats import LoopSummary
 from .operator_log import OperatorLog
 from .policy_file import SHIPPED_POLICY, PolicyFile
-from .received import linear_velocity, planar_velocity
+from .received import planar_velocity
 from .supervisor import Supervisor
 from .tick_input import MotorStatus as Motors
 from .transitions import MODES
@@ -79,9 +74,10 @@ class Controller(Node):
             self._sim_time,
             None if self._sim_time else time.monotonic,
         )
-        self._refusals, self._message = Refusals(), LowCmd()
+        self._refusals = Refusals()
         self._refused_before = self._overruns_before = self._pauses_before = 0
         self._operator_log = OperatorLog(self._supervisor)
+        self._loop_summary = LoopSummary()  # of the last second
         self._reports = self._silent_reports = 0  # total, and since the last low_state
         self._create_interfaces()
         if not self._sim_time:  # simulated time waits for the node, so it needs no priority
@@ -96,10 +92,10 @@ class Controller(Node):
         state_qos = (
             LATEST_QOS if self._sim_time else QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         )
-        self._states = self.create_subscription(LowState, "low_state", self._on_state, state_qos)
+        self._states = self.create_subscription(LowState, "low_state", self._on_state, state_qos, raw=True)
         self.create_subscription(Waiting, "waiting", self._on_waiting, LATEST_QOS)
         self.create_subscription(
-            TwistWithCovarianceStamped, "velocity_estimate", self._on_velocity, LATEST_QOS
+            TwistWithCovarianceStamped, "velocity_estimate", self._on_velocity, LATEST_QOS, raw=True
         )
         self.create_subscription(VelocityCommand, "command", self._on_command, LATEST_QOS)
         self.create_subscription(MotorStatus, "motor_status", self._on_motors, 1)
@@ -112,10 +108,10 @@ class Controller(Node):
     def _now(self) -> float:
         return float(1e-9 * self.get_clock().now().nanoseconds)
 
-    def _on_state(self, message: Any) -> None:
+    def _on_state(self, data: bytes) -> None:
         self._silent_reports = 0
         try:
-            self._loop.on_state(read_low_state(message))
+            self._loop.on_state(decode_low_state(data)[1])
         except MessageError as error:
             self._refuse("low_state", error)
 
@@ -126,9 +122,9 @@ class Controller(Node):
         except MessageError as error:
             self._refuse("waiting", error)
 
-    def _on_velocity(self, message: Any) -> None:
+    def _on_velocity(self, data: bytes) -> None:
         try:
-            self._loop.on_velocity(seconds(message.header.stamp), linear_velocity(message.twist.twist))
+            self._loop.on_velocity(*decode_estimate(data))
         except MessageError as error:
             self._refuse("velocity_estimate", error)
 
@@ -151,9 +147,8 @@ class Controller(Node):
         self._loop.inputs.motors = Motors(temperature, np.array(message.dropped_out, bool))
 
     def _publish(self, answer: JointCommand) -> None:
-        self._message.stamp = self.get_clock().now().to_msg()
-        write_low_cmd(answer, self._message)
-        self._low_cmd.publish(self._message)
+        stamp = divmod(self.get_clock().now().nanoseconds, 10**9)
+        self._low_cmd.publish(encode_low_cmd(stamp, answer))
         self._log_changes()
 
     def _on_set_mode(self, request: Any, response: Any) -> Any:
@@ -178,12 +173,14 @@ class Controller(Node):
                 log.info(sentence)
 
     def _watch(self) -> None:
-        """Run the watchdog of the loop and publish controller/state, at 50 Hz."""
+        """Run the watchdog of the loop and publish controller/state, at 50 Hz; its percentiles at 1 Hz."""
         self._loop.watch()
-        self._controller_state.publish(self._state_message())
+        if self._controller_state.get_subscription_count():
+            self._controller_state.publish(self._state_message())
 
     def _state_message(self) -> Any:
-        supervisor, stats = self._supervisor, self._loop.stats.summary(time.perf_counter())
+        supervisor = self._supervisor
+        stats = attrs.evolve(self._loop_summary, overruns=self._loop.stats.overruns)
         message = ControllerState(
             stamp=self.get_clock().now().to_msg(),
             mode=MODES.index(supervisor.mode),
@@ -204,6 +201,7 @@ class Controller(Node):
     def _report(self) -> None:
         """Publish /diagnostics and check for a second publisher of states, at 1 Hz."""
         self._loop.inputs.duplicate_publisher = self._duplicate_publisher()
+        self._loop_summary = self._loop.stats.summary(time.perf_counter())
         self._silent_reports += 1
         if self._sim_time and self._loop.inputs.state is not None and self._silent_reports > SILENCE_LIMIT_S:
             self._supervisor.fail(
@@ -214,10 +212,7 @@ class Controller(Node):
             "mode": self._supervisor.mode,
             "reason": self._supervisor.reason,
             "policy": self._settings.policy or f"the shipped one ({SHIPPED_POLICY.name})",
-            **{
-                name: number_text(value, ".4g")
-                for name, value in attrs.asdict(self._loop.stats.summary(time.perf_counter())).items()
-            },
+            **{name: number_text(value, ".4g") for name, value in attrs.asdict(self._loop_summary).items()},
             "pauses": self._loop.stall_detector.count,
             "stalled_s": f"{self._loop.stalled:.3f}",
             **{f"limit {name}": f"acted in {count} ticks" for name, count in self._supervisor.limits.items()},

@@ -115,6 +115,16 @@ class GuardConfig:
         """Longest time without a state, and largest age of the state, s; longer if the robot's time may stand still."""
         return self.max_standstill if self.robot_waits else self.max_state_age
 
+    @cached_property
+    def joint_range(self) -> tuple[Array, Array]:
+        """Smallest and largest accepted angle of each joint, (12,), rad."""
+        return LOWER - self.joint_margin, UPPER + self.joint_margin
+
+    @cached_property
+    def joint_speeds(self) -> Array:
+        """Largest accepted speed of each joint, (12,), rad/s."""
+        return self.max_joint_speed * VELOCITY_LIMIT
+
 
 @attrs.define
 class GuardInput:
@@ -158,13 +168,23 @@ class GuardInput:
     @cached_property
     def is_sound(self) -> bool:
         """Whether all numbers are finite and all joints within their limits; one check for the usual case."""
-        state, c = self.state, self.config
-        low, high = LOWER - c.joint_margin, UPPER + c.joint_margin
+        state, (low, high) = self.state, self.config.joint_range
         return bool(
             np.count_nonzero((state.q >= low) & (state.q <= high)) == 12
-            and np.count_nonzero(np.abs(state.dq) <= c.max_joint_speed * VELOCITY_LIMIT) == 12
+            and np.count_nonzero(np.abs(state.dq) <= self.config.joint_speeds) == 12
             and all(map(math.isfinite, (*state.quaternion.tolist(), *state.angular_velocity.tolist())))
         )
+
+    @cached_property
+    def motion(self) -> Array:
+        """Change of the joint angles since the previous state, (12,), rad; there must be one."""
+        assert self.previous is not None
+        return self.state.q - self.previous.q
+
+    @cached_property
+    def commanded_torque(self) -> Array:
+        """Torque that `command` asks for at the present joint state, (12,), N m."""
+        return self.command.torque(self.state.q, self.state.dq)
 
 
 class Guard:

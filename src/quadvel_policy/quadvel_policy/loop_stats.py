@@ -21,7 +21,7 @@ class Histogram:
     _WIDTH = math.log(1.01)
 
     def __init__(self) -> None:
-        self._counts = np.zeros(math.ceil(math.log(10.0 / self._SHORTEST) / self._WIDTH) + 1, np.int64)
+        self._counts = [0] * (math.ceil(math.log(10.0 / self._SHORTEST) / self._WIDTH) + 1)
 
     def add(self, seconds: float) -> None:
         """Count one duration.
@@ -41,7 +41,7 @@ class Histogram:
         Returns:
             The duration, s, within 1 %; NaN before the first `add`.
         """
-        cumulated = self._counts.cumsum()
+        cumulated = np.cumsum(self._counts)
         total = int(cumulated[-1])
         if not total:
             return math.nan

@@ -426,6 +426,7 @@ class ActionMap:
             Joint targets, (..., 12), rad.
         """
         if self.clip is not None:
-            action = np.clip(action, *self.clip)
+            low, high = self.clip
+            action = np.minimum(np.maximum(action, low), high)
         targets: Array = self.offset + self.scale * np.asarray(action)
         return targets

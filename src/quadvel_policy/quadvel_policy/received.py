@@ -45,21 +45,6 @@ class StampCheck:
         self._stamp = stamp
 
 
-def linear_velocity(twist: Any) -> Array:
-    """Read the linear part of a twist.
-
-    Args:
-        twist: A geometry_msgs/Twist.
-
-    Returns:
-        Velocity, (3,), m/s.
-
-    Raises:
-        NotFiniteError: A number is not finite.
-    """
-    return _finite("linear", [twist.linear.x, twist.linear.y, twist.linear.z])
-
-
 def planar_velocity(twist: Any) -> Array:
     """Read the planar part of a twist.
 
@@ -72,12 +57,8 @@ def planar_velocity(twist: Any) -> Array:
     Raises:
         NotFiniteError: A number is not finite.
     """
-    linear = linear_velocity(twist)
-    angular = _finite("angular", [twist.angular.x, twist.angular.y, twist.angular.z])
-    return np.array([linear[0], linear[1], angular[2]])
-
-
-def _finite(field: str, values: list[float]) -> Array:
-    if not all(map(math.isfinite, values)):
-        raise NotFiniteError(f"{field} is {values}, expected finite numbers")
-    return np.array(values, float)
+    for field in ("linear", "angular"):
+        values = [getattr(getattr(twist, field), axis) for axis in "xyz"]
+        if not all(map(math.isfinite, values)):
+            raise NotFiniteError(f"{field} is {values}, expected finite numbers")
+    return np.array([twist.linear.x, twist.linear.y, twist.angular.z])

@@ -38,6 +38,10 @@ from .transitions import (
 STANCE_COMMAND = np.array([0.0, 0.0, 0.0, 1.0])
 VELOCITY_DECAY_S = 0.2
 """Decay time of the last known velocity while the robot brakes without an estimate."""
+CONFIRMED_SHARE = 0.5
+"""Share of the largest accepted difference of estimate and Kalman filter up to which a filter that
+is some states behind confirms the estimate.
+"""
 MIN_STEPPING_SPEED = 0.2
 """m/s, above which a robot that must stand continues stepping: feet that stop under a moving trunk
 trip it.
@@ -221,7 +225,7 @@ class Supervisor:
         if self._config.reset_gap < guard_input.gap <= self._config.guards.silence_limit:
             self._walk.reset()
         self._follow_table(mode_input)
-        answer = self._run_mode(mode_input)
+        answer = self._run_mode(mode_input, guard_input)
         answer.tick = state.tick
         self._previous_answer, self._deferred_input = answer, guard_input
         return answer
@@ -240,13 +244,15 @@ class Supervisor:
         if self.mode in DAMPED_MODES:
             self._backup.reset()
         else:
-            self._backup.update(self._deferred_input.state)
+            self._backup.add(self._deferred_input.state)
         self._deferred_input = None
 
     def _run_guards(self, state: RobotState) -> GuardInput:
         """Run the immediate guards; `findings` are those that have an effect in this mode."""
         now, inputs = self._situation, self._situation.inputs
         before = now.last.state if now.last else None
+        velocity = None if inputs.velocity is None else np.asarray(inputs.velocity, float)
+        self._backup.confirm(velocity, CONFIRMED_SHARE * self._config.guards.max_velocity_error)
         guard_input = GuardInput(
             config=self._config.guards,
             mode=now.mode,
@@ -255,7 +261,7 @@ class Supervisor:
             age=inputs.now - state.time,
             gap=state.time - before.time if before else 0.0,
             command=self._previous_answer,
-            velocity=None if inputs.velocity is None else np.asarray(inputs.velocity, float),
+            velocity=velocity,
             backup=self._backup.velocity,
             is_moving=now.mode == "walk" and not self.command[3],
             overruns=inputs.overruns,
@@ -289,7 +295,7 @@ class Supervisor:
         """
         now = self._situation
         distrusted = any(finding.name in UNTRUSTED_ESTIMATE_FAULTS for finding in now.findings)
-        velocity = guard_input.backup if distrusted else guard_input.velocity
+        velocity = self._backup.newest() if distrusted else guard_input.velocity
         if velocity is not None:
             now.velocity = velocity
         elif now.mode == "walk":
@@ -307,7 +313,7 @@ class Supervisor:
             now.auto_stand = False
             self._switch(mode, entry.reason(now), entry.fault)
 
-    def _run_mode(self, mode_input: ModeInput) -> JointCommand:
+    def _run_mode(self, mode_input: ModeInput, guard_input: GuardInput) -> JointCommand:
         mode = self._modes[self.mode]
         if self._entered_at is None:
             self._entered_at = mode_input.state.time
@@ -320,7 +326,7 @@ class Supervisor:
             return JointCommand.damping(self._config.damping_kd)
         if self.mode == "walk":
             self.inference_seconds = self._walk.inference_seconds
-        self._limiter.apply(answer, self._previous_answer, mode_input.state)
+        self._limiter.apply(answer, guard_input.commanded_torque, mode_input.state)
         return answer
 
     def _effective_command(self, inputs: TickInput) -> tuple[Array, str]:
@@ -342,8 +348,7 @@ class Supervisor:
         if numbers[3] >= 0.5 or not (now.neutral_seen and now.is_walking_allowed):
             return STANCE_COMMAND.copy(), ""
         clamped = self._command_limits.clamp(numbers[:3])
-        is_within = np.array_equal(clamped, numbers[:3])
-        return np.array([*clamped, 0.0]), "" if is_within else "command_out_of_range"
+        return np.array([*clamped, 0.0]), "" if clamped == tuple(numbers[:3]) else "command_out_of_range"
 
     def _switch(self, mode: str, reason: str, fault: str = "") -> None:
         now = self._situation

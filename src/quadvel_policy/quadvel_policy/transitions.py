@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 
 import attrs
@@ -76,7 +77,7 @@ class Situation:
     @property
     def speed(self) -> float:
         """Last known speed of the trunk, m/s."""
-        return float(np.linalg.norm(self.velocity))
+        return math.hypot(*self.velocity.tolist())
 
     @property
     def posture_error(self) -> str:

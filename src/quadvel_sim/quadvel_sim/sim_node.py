@@ -6,14 +6,14 @@ Its base `SimulationNode` publishes the ground truth and has the services.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from rosgraph_msgs.msg import Clock as ClockMessage
 from typing_extensions import override
 
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState, Waiting
-from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
+from quadvel_nodes.flat_messages import decode_low_cmd, encode_low_state
+from quadvel_nodes.messages import Refusals
 from quadvel_nodes.node import run
 from quadvel_nodes.robot_view import RobotView
 from quadvel_sim.config import SimulatorConfig
@@ -41,7 +41,7 @@ class SimNode(SimulationNode[SimParameters]):
         self._clock_publisher = self.create_publisher(ClockMessage, "/clock", 10)
         noise = self._loop.simulator.config.noise
         self._view = RobotView(self, noise.orientation, noise.angular_velocity, noise.linear_acceleration)
-        self.create_subscription(LowCmd, "low_cmd", self._on_command, 10)
+        self.create_subscription(LowCmd, "low_cmd", self._on_command, 10, raw=True)
         self.start()
 
     @override
@@ -49,9 +49,7 @@ class SimNode(SimulationNode[SimParameters]):
         stamp = self.stamp(instant)
         if self._settings.mode != REALTIME:
             self._clock_publisher.publish(ClockMessage(clock=stamp))
-        message = LowState(stamp=stamp)
-        write_low_state(state, message)
-        self._low_state.publish(message)
+        self._low_state.publish(encode_low_state((stamp.sec, stamp.nanosec), state))
         if view_is_due:
             self._view.publish(stamp, state)
 
@@ -73,10 +71,10 @@ class SimNode(SimulationNode[SimParameters]):
             return f"{refused} messages refused in the last second"
         return "waiting for the LowCmd that answers the last state" if unanswered else ""
 
-    def _on_command(self, message: Any) -> None:
+    def _on_command(self, data: bytes) -> None:
         """Pass a command to the simulation."""
         try:
-            self._loop.submit(read_low_cmd(message))
+            self._loop.submit(decode_low_cmd(data))
         except ValueError as error:
             self._refusals.add("low_cmd", error)
 

@@ -182,8 +182,9 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         self.publish_sample(state, instant, view)
         if self._world_view is not None:
             self._world_view.publish(self.stamp(instant), self._loop.simulator, view)
-        if self._samples % max(1, TRUTH_PERIOD_MS // self._settings.period) == 0:
-            transform = view and self._settings.publish_tf
+        truth = self._samples % max(1, TRUTH_PERIOD_MS // self._settings.period) == 0
+        transform = view and self._settings.publish_tf
+        if truth and (transform or self._truth.get_subscription_count()):
             self._publish_truth(self.stamp(instant), self._loop.simulator.truth(), transform)
         self._samples += 1
 

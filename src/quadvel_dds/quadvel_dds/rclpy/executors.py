@@ -200,11 +200,13 @@ class Executor(Partial):
             timers, waiting = self._timers, self._waiting
         if not self.context.ok():  # a signal may have come before the wait set existed
             return
-        wakes = (timer._wake_ns() for timer in timers)
-        wake_ns = min([deadline_ns, *(wake for wake in wakes if wake is not None)])
-        waitset.wait(min(max(0, wake_ns - time.monotonic_ns()), MAX_WAIT_NS))
-        self._ready.extend(timer for timer in timers if timer.is_ready())
-        self._ready.extend(entity for entity in waiting if entity._reader.has_data())
+        wakes = [(wake, timer) for timer in timers if (wake := timer._wake_ns()) is not None]
+        wake_ns = min([deadline_ns, *(wake for wake, _ in wakes)])
+        found = waitset.wait(min(max(0, wake_ns - time.monotonic_ns()), MAX_WAIT_NS))
+        now = time.monotonic_ns()
+        self._ready.extend(timer for wake, timer in wakes if wake <= now)
+        if found:
+            self._ready.extend(entity for entity in waiting if entity._reader in found)
 
 
 class SingleThreadedExecutor(Executor):

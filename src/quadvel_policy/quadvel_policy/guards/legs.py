@@ -7,9 +7,8 @@ import math
 import numpy as np
 from typing_extensions import override
 
-from quadvel_description.arrays import Array
-from quadvel_description.robot import JOINT_NAMES, LEGS, LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
-from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
+from quadvel_description.robot import JOINT_NAMES, LEGS, LOWER, TORQUE_LIMIT, UPPER
+from quadvel_description.state import MODE_DAMPING
 
 from ..guard import MOVING_MODES, WALK_MODES, Guard, GuardInput, Level
 
@@ -39,7 +38,7 @@ class JointTooFast(Guard):
     def check(self, data: GuardInput) -> str | None:
         if data.is_sound:
             return None
-        limit = data.config.max_joint_speed * VELOCITY_LIMIT
+        limit = data.config.joint_speeds
         for i in np.flatnonzero(np.abs(data.state.dq) > limit):
             return f"{JOINT_NAMES[i]} moves at {data.state.dq[i]:.0f} rad/s, limit {limit[i]:.0f}"
         return None
@@ -64,18 +63,19 @@ class EncoderInconsistent(Guard):
         if data.mode not in MOVING_MODES or data.previous is None or data.gap <= 0.0 or not data.is_sound:
             self._error[:] = 0.0
             return None
-        motion = data.state.q - data.previous.q
         if data.gap <= 0.01:
-            unexplained = motion - 0.5 * data.gap * (data.state.dq + data.previous.dq)
+            unexplained = data.motion - 0.5 * data.gap * (data.state.dq + data.previous.dq)
         else:  # after a gap the path is unknown; count only motion beyond the largest speed
-            unexplained = np.sign(motion) * np.maximum(
-                np.abs(motion) - data.config.max_joint_speed * VELOCITY_LIMIT * data.gap, 0.0
+            unexplained = np.sign(data.motion) * np.maximum(
+                np.abs(data.motion) - data.config.joint_speeds * data.gap, 0.0
             )
-        self._error = self._error * math.exp(-data.gap / ENCODER_WINDOW_S) + unexplained
-        i = int(np.argmax(np.abs(self._error)))
-        error, limit = self._error[i], data.config.max_encoder_error
-        if abs(error) <= limit:
+        self._error *= math.exp(-data.gap / ENCODER_WINDOW_S)
+        self._error += unexplained
+        limit = data.config.max_encoder_error
+        if np.count_nonzero(np.abs(self._error) <= limit) == 12:
             return None
+        i = int(np.argmax(np.abs(self._error)))
+        error = self._error[i]
         return f"{JOINT_NAMES[i]}'s angle is {error:+.2f} rad off its integrated speed, limit {limit:.2f}"
 
 
@@ -92,7 +92,10 @@ class EncoderFrozen(Guard):
         if data.previous is None or data.command.mode == MODE_DAMPING:
             self._time[:] = 0.0
             return None
-        motion = np.abs(data.state.q - data.previous.q)
+        if np.count_nonzero(data.motion) == 12:  # the usual case: every reading has changed
+            self._time[:] = 0.0
+            return None
+        motion = np.abs(data.motion)
         is_same = (motion == 0.0) & (data.state.dq == data.previous.dq)
         since = is_same & (self._time > 0.0)
         self._time = np.where(is_same, self._time + data.gap, 0.0)
@@ -119,21 +122,24 @@ class DriveDoesNotAnswer(Guard):
     is_immediate = False
 
     def __init__(self) -> None:
-        self._expected, self._reported = np.zeros(12), np.zeros(12)
+        self._means = np.zeros((2, 12))  # of the commanded and of the reported torque
+        self._now = np.zeros((2, 12))
 
     @override
     def check(self, data: GuardInput) -> str | None:
-        if data.mode not in MOVING_MODES or not data.state.tau.any():
-            self._expected[:] = self._reported[:] = 0.0
+        if data.mode not in MOVING_MODES or not np.count_nonzero(data.state.tau):
+            self._means[:] = 0.0
             return None
         share = -math.expm1(-max(data.gap, 0.0) / TORQUE_WINDOW_S)
-        self._expected += share * (ideal_torque(data.command, data.state) - self._expected)
-        self._reported += share * (data.state.tau - self._reported)
-        error = np.abs(self._reported - self._expected)
-        i = int(np.argmax(error))
-        if not error[i] > data.config.max_torque_error:
+        expected, reported = self._means
+        np.minimum(np.maximum(data.commanded_torque, -TORQUE_LIMIT), TORQUE_LIMIT, out=self._now[0])
+        self._now[1] = data.state.tau
+        self._means += share * (self._now - self._means)
+        error = np.abs(reported - expected)
+        if not np.count_nonzero(error > data.config.max_torque_error):
             return None
-        return f"{JOINT_NAMES[i]} gives {self._reported[i]:+.0f} N m, commanded {self._expected[i]:+.0f} N m"
+        i = int(np.argmax(error))
+        return f"{JOINT_NAMES[i]} gives {reported[i]:+.0f} N m, commanded {expected[i]:+.0f} N m"
 
 
 class JointStuck(Guard):
@@ -150,6 +156,9 @@ class JointStuck(Guard):
     def check(self, data: GuardInput) -> str | None:
         q = data.state.q
         pushes = np.abs(data.state.tau) > data.config.stuck_torque * TORQUE_LIMIT
+        if not np.count_nonzero(pushes):  # the usual case
+            self._time[:], self._stuck_at = 0.0, q
+            return None
         stays = pushes & (np.abs(q - self._stuck_at) < STUCK_RANGE_RAD)
         self._time = np.where(stays, self._time + max(data.gap, 0.0), 0.0)
         self._stuck_at = np.where(stays, self._stuck_at, q)
@@ -202,23 +211,7 @@ class FootForceFrozen(Guard):
             return None
         is_same = data.state.foot_force == data.previous.foot_force
         self._time = np.where(is_same, self._time + data.gap, 0.0)
-        for i in np.flatnonzero(self._time > data.config.frozen_foot_time):
+        frozen = self._time > data.config.frozen_foot_time
+        for i in np.flatnonzero(frozen) if np.count_nonzero(frozen) else ():
             return f"the force of foot {LEGS[i]} has stayed at {data.state.foot_force[i]:.0f} N for {self._time[i]:.1f} s"
         return None
-
-
-def ideal_torque(command: JointCommand, state: RobotState) -> Array:
-    """Compute the torque that an ideal drive gives for a command at the present joint state.
-
-        tau = clip(kp (q_des - q) + kd (dq_des - dq) + tau_ff, -TORQUE_LIMIT, TORQUE_LIMIT)
-
-    Args:
-        command: The joint command.
-        state: Present angles and speeds.
-
-    Returns:
-        Torques, (12,), N m.
-    """
-    requested = command.torque(state.q, state.dq)
-    torque: Array = np.minimum(np.maximum(requested, -TORQUE_LIMIT), TORQUE_LIMIT)
-    return torque

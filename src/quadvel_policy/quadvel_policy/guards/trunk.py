@@ -8,7 +8,7 @@ import numpy as np
 from typing_extensions import override
 
 from quadvel_description.arrays import Array
-from quadvel_description.kinematics import rotate
+from quadvel_description.kinematics import rotate_one
 from quadvel_description.robot import GRAVITY
 
 from ..guard import MOVING_MODES, Guard, GuardInput, Level
@@ -38,7 +38,7 @@ class ImuInconsistent(Guard):
     is_immediate = False
 
     def __init__(self) -> None:
-        self._error = np.zeros(3)
+        self._error = (0.0, 0.0, 0.0)
 
     @override
     def check(self, data: GuardInput) -> str | None:
@@ -48,12 +48,21 @@ class ImuInconsistent(Guard):
             or not 0.0 < data.gap <= 0.01
             or not data.is_sound
         ):
-            self._error[:] = 0.0
+            self._error = (0.0, 0.0, 0.0)
             return None
-        turned = _rotation_between(data.previous.quaternion, data.state.quaternion)
-        gyro = 0.5 * data.gap * (data.state.angular_velocity + data.previous.angular_velocity)
-        self._error = self._error * math.exp(-data.gap / GYRO_WINDOW_S) + turned - gyro
-        error, limit = math.hypot(*self._error.tolist()), data.config.max_attitude_error
+        kept, half = math.exp(-data.gap / GYRO_WINDOW_S), 0.5 * data.gap
+        x, y, z = (
+            e * kept + angle - half * (now + before)
+            for e, angle, now, before in zip(
+                self._error,
+                _rotation_between(data.previous.quaternion, data.state.quaternion),
+                data.state.angular_velocity.tolist(),
+                data.previous.angular_velocity.tolist(),
+                strict=True,
+            )
+        )
+        self._error = x, y, z
+        error, limit = math.hypot(x, y, z), data.config.max_attitude_error
         if error <= limit:
             return None
         return f"the orientation is {error:.2f} rad off the integrated gyroscope, limit {limit:.2f}"
@@ -74,16 +83,14 @@ class ImuFrozen(Guard):
     def check(self, data: GuardInput) -> str | None:
         if data.previous is None:
             return None
-        gyro = data.state.angular_velocity
+        gyro = data.state.angular_velocity.tolist()
         is_same = (
-            np.array_equal(gyro, data.previous.angular_velocity)
-            and np.array_equal(data.state.quaternion, data.previous.quaternion)
-            and gyro.any()
+            gyro == data.previous.angular_velocity.tolist()
+            and data.state.quaternion.tolist() == data.previous.quaternion.tolist()
+            and any(gyro)
         )
         self._time = self._time + data.gap if is_same else 0.0
-        self._joint_travel = (
-            self._joint_travel + float(np.abs(data.state.q - data.previous.q).max()) if is_same else 0.0
-        )
+        self._joint_travel = self._joint_travel + float(np.abs(data.motion).max()) if is_same else 0.0
         if self._time <= data.config.frozen_time or self._joint_travel <= NOTABLE_MOTION_RAD:
             return None
         return f"the IMU has not changed for {1e3 * self._time:.0f} ms while the joints moved"
@@ -100,31 +107,35 @@ class AccelerometerImplausible(Guard):
     level = Level.STANCE
 
     def __init__(self) -> None:
-        self._mean = np.zeros(3)
+        self._mean = (0.0, 0.0, 0.0)
 
     @override
     def check(self, data: GuardInput) -> str | None:
-        if not np.isfinite(data.state.linear_acceleration).all():
+        measured = data.state.linear_acceleration.tolist()
+        if not all(map(math.isfinite, measured)):
             return "the state's linear_acceleration is not finite"
-        if not data.state.linear_acceleration.any():
+        if not any(measured):
             return None
-        now = rotate(data.state.quaternion, data.state.linear_acceleration)
-        now[2] -= GRAVITY
-        self._mean += (now - self._mean) * -math.expm1(-max(data.gap, 0.0) / ACCELERATION_WINDOW_S)
-        mean, limit = math.hypot(*self._mean.tolist()), data.config.max_acceleration_error
+        x, y, z = rotate_one(data.state.quaternion.tolist(), measured)
+        share = -math.expm1(-max(data.gap, 0.0) / ACCELERATION_WINDOW_S)
+        a, b, c = self._mean
+        self._mean = a + (x - a) * share, b + (y - b) * share, c + (z - GRAVITY - c) * share
+        mean, limit = math.hypot(*self._mean), data.config.max_acceleration_error
         if mean <= limit:
             return None
         return f"the accelerometer shows {mean:.1f} m/s^2 on the mean of half a second, limit {limit:.1f}"
 
 
-def _rotation_between(before: Array, after: Array) -> Array:
-    """Return the rotation vector of a small rotation between two orientations, (3,), rad, body frame.
+def _rotation_between(before: Array, after: Array) -> tuple[float, float, float]:
+    """Return the rotation vector of a small rotation between two orientations, rad, body frame.
 
     Twice the vector part of conj(before) * after; the sign selects the shorter rotation.
     """
     w, x, y, z = before.tolist()
     a, b, c, d = after.tolist()
     sign = 2.0 if w * a + x * b + y * c + z * d >= 0.0 else -2.0
-    return sign * np.array(
-        [w * b - x * a - y * d + z * c, w * c + x * d - y * a - z * b, w * d - x * c + y * b - z * a]
+    return (
+        sign * (w * b - x * a - y * d + z * c),
+        sign * (w * c + x * d - y * a - z * b),
+        sign * (w * d - x * c + y * b - z * a),
     )

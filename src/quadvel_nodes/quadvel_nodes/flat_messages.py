@@ -1,0 +1,171 @@
+"""The messages of each control tick as bytes, without an object for each field.
+
+LowState, LowCmd and the velocity estimate have fixed layouts in CDR, the encoding of DDS. A
+subscription with `raw=True` delivers these bytes, and a publisher accepts them. All other messages
+pass as objects (`messages`).
+
+A number is aligned to its own size, counted from the end of the 4 bytes of encapsulation:
+
+    LowState            stamp (s, ns), tick, 50 float32
+    LowCmd              stamp (s, ns), tick, mode, 3 bytes, 60 float32
+    velocity estimate   stamp (s, ns), length and characters of frame_id, bytes up to a multiple
+                        of 8, 6 float64 (linear, angular), 36 float64 (covariance)
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quadvel_description.arrays import Array
+from quadvel_description.state import JointCommand, RobotState
+
+from .messages import (
+    LOW_CMD_SIZES,
+    LOW_STATE_SIZES,
+    MessageError,
+    NotFiniteError,
+    NumericFields,
+    robot_state,
+)
+
+LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+"""Encapsulation of plain CDR, little endian: all messages of a little-endian machine."""
+_STATE_HEAD, _COMMAND_HEAD = struct.Struct("<4siII"), struct.Struct("<4siIIB3x")
+_ESTIMATE_HEAD = struct.Struct("<4siII")
+_STATE_FIELDS, _COMMAND_FIELDS = NumericFields(LOW_STATE_SIZES), NumericFields(LOW_CMD_SIZES)
+Stamp = tuple[int, int]
+"""Time as s and ns."""
+
+
+def decode_low_state(data: bytes) -> tuple[Stamp, RobotState]:
+    """Convert a LowState to a RobotState and normalise its quaternion.
+
+    Args:
+        data: The LowState in CDR.
+
+    Returns:
+        The stamp, and the state; its `time` is the stamp, s.
+
+    Raises:
+        MessageError: The bytes are no LowState.
+        NotFiniteError: A number is NaN or infinite.
+        NotUnitError: The norm of the quaternion is not 1 within QUATERNION_TOLERANCE.
+    """
+    seconds, nanoseconds, tick = _unpack(_STATE_HEAD, data)
+    fields = _STATE_FIELDS.split(_floats(data, _STATE_HEAD.size, np.float32, 50))
+    return (seconds, nanoseconds), robot_state(float(seconds + 1e-9 * nanoseconds), tick, fields)
+
+
+def encode_low_state(stamp: Stamp, state: RobotState) -> bytes:
+    """Convert a RobotState to a LowState.
+
+    Args:
+        stamp: Time of the state.
+        state: The state.
+
+    Returns:
+        The LowState in CDR.
+    """
+    head = _STATE_HEAD.pack(LITTLE_ENDIAN, *stamp, state.tick)
+    fields = (state.q, state.dq, state.tau, state.quaternion)
+    more = (state.angular_velocity, state.linear_acceleration, state.foot_force)
+    return head + np.concatenate((*fields, *more), dtype=np.float32, casting="same_kind").tobytes()
+
+
+def decode_low_cmd(data: bytes) -> JointCommand:
+    """Convert a LowCmd to a JointCommand.
+
+    Args:
+        data: The LowCmd in CDR.
+
+    Returns:
+        The joint command.
+
+    Raises:
+        MessageError: The bytes are no LowCmd.
+        NotFiniteError: A number is NaN or infinite.
+    """
+    _, _, tick, mode = _unpack(_COMMAND_HEAD, data)
+    q, dq, tau, kp, kd = _COMMAND_FIELDS.split(_floats(data, _COMMAND_HEAD.size, np.float32, 60))
+    return JointCommand(q, dq, tau, kp, kd, mode, tick)
+
+
+def encode_low_cmd(stamp: Stamp, command: JointCommand) -> bytes:
+    """Convert a JointCommand to a LowCmd.
+
+    Args:
+        stamp: Present time.
+        command: The joint command.
+
+    Returns:
+        The LowCmd in CDR.
+    """
+    head = _COMMAND_HEAD.pack(LITTLE_ENDIAN, *stamp, command.tick, command.mode)
+    fields = (command.q, command.dq, command.tau, command.kp, command.kd)
+    return head + np.concatenate(fields, dtype=np.float32, casting="same_kind").tobytes()
+
+
+def encode_estimate(
+    stamp: Stamp, frame: str, linear: ArrayLike, angular: ArrayLike, covariance: Array
+) -> bytes:
+    """Write a velocity estimate, a geometry_msgs/TwistWithCovarianceStamped.
+
+    Args:
+        stamp: Time of the estimate.
+        frame: Frame of the velocities.
+        linear: Linear velocity, (3,), m/s.
+        angular: Angular velocity, (3,), rad/s.
+        covariance: Covariance, (36,): x, y, z and the rotations about them.
+
+    Returns:
+        The message in CDR.
+    """
+    name = frame.encode() + b"\0"
+    head = _ESTIMATE_HEAD.pack(LITTLE_ENDIAN, *stamp, len(name)) + name
+    return (
+        head.ljust(_estimate_offset(len(name)), b"\0")
+        + np.concatenate((linear, angular, covariance)).tobytes()
+    )
+
+
+def decode_estimate(data: bytes) -> tuple[float, Array]:
+    """Read a velocity estimate, a geometry_msgs/TwistWithCovarianceStamped.
+
+    Args:
+        data: The message in CDR.
+
+    Returns:
+        Time of the estimate, s, and linear velocity, (3,), m/s.
+
+    Raises:
+        MessageError: The bytes are no such message.
+        NotFiniteError: A number of the velocity is NaN or infinite.
+    """
+    seconds, nanoseconds, length = _unpack(_ESTIMATE_HEAD, data)
+    velocity = _floats(data, _estimate_offset(length), np.float64, 3)
+    if not all(map(math.isfinite, values := velocity.tolist())):
+        raise NotFiniteError(f"linear is {values}, expected finite numbers")
+    return float(seconds + 1e-9 * nanoseconds), velocity
+
+
+def _estimate_offset(length: int) -> int:
+    """Return the place of the first number after a frame_id of `length` bytes."""
+    return 4 + -(-(_ESTIMATE_HEAD.size - 4 + length) // 8) * 8
+
+
+def _unpack(head: struct.Struct, data: bytes) -> tuple[int, ...]:
+    """Return the numbers of the head after the encapsulation."""
+    if len(data) < head.size or not data.startswith(LITTLE_ENDIAN[:2]):
+        raise MessageError(f"message begins with {data[:4].hex()}, expected {LITTLE_ENDIAN.hex()} and a head")
+    return head.unpack_from(data)[1:]
+
+
+def _floats(data: bytes, offset: int, kind: type[np.floating], count: int) -> Array:
+    """Return a copy of `count` numbers as float64."""
+    if len(data) < offset + count * np.dtype(kind).itemsize:
+        raise MessageError(f"message has {len(data)} bytes, expected {count} numbers from byte {offset} on")
+    return np.frombuffer(data, kind, count, offset).astype(np.float64)
