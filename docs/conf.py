@@ -15,6 +15,7 @@ sys.path.insert(0, str(DOCS / "_ext"))
 quadvel_dds.install()  # modules of nodes import rclpy and messages
 # What the tutorials run: the commands of this environment, on a DDS domain of their own.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+os.environ["QUADVEL"] = str(ROOT)
 os.environ["PYTHONSTARTUP"] = str(DOCS / "_ext" / "terminal.py")
 os.environ.setdefault("ROS_DOMAIN_ID", "3")  # the demo has 0, tests have 4 and more
 
