@@ -18,7 +18,7 @@ BUILD_INTERFACES := ros_ws/wheels/build_interfaces.py
 INTERFACES := $(BUILD_INTERFACES) $(wildcard src/quadvel_msgs/*/* ros_ws/wheels/*/*/*)
 INSTALL = -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable
 
-.PHONY: help setup ros demo close-the-loop paper faults test ros-tests test-ros lint format bench lock clean
+.PHONY: help setup ros demo close-the-loop paper faults test ros-tests test-ros lint format docs pictures bench lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -53,6 +53,12 @@ lint: $(VENV)/.lint  ## check code and documents with ruff, codespell and mypy
 format: $(VENV)/.lint  ## format the code with ruff and apply its automatic fixes
 	$(VENV)/bin/ruff check --fix
 	$(VENV)/bin/ruff format
+
+docs: $(VENV)/.docs  ## build the site, and run its tutorials; results in out/docs
+	$(PY) -m sphinx --builder html --fail-on-warning --keep-going docs out/docs
+
+pictures: $(VENV)/.test  ## take the pictures of the documents again; needs an idle machine
+	$(PY) docs/pictures.py
 
 faults: setup  ## inject faults into a simulated robot and measure its reaction; results in out/faults
 	$(VENV)/bin/quadvel faults --out out/faults
@@ -92,6 +98,10 @@ $(VENV)/.test: $(VENV)/.run
 	$(PY) $(INSTALL) '.[eval,view,formats,test,train]'
 	@# The vendor's client of a Go2, which drives our board; OpenCV, which it names, is for its video alone.
 	$(PY) -m pip install --quiet --disable-pip-version-check --no-deps unitree-sdk2py-dimos==1.0.3
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.run
+	$(PY) $(INSTALL) '.[eval,view,docs]'
 	@touch $@
 
 # The wheels are only for x86-64, and our interfaces are compiled: both are checked before the installation.

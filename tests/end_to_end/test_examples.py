@@ -95,6 +95,7 @@ LEFT_OUT = {
     "quadvel people --scans FOLDER --out out/people": "real scans that are no part of this repository; "
     "tests/quadvel_follow takes them where they are",
     "quadvel up --world campus": "as with --terrain",
+    "quadvel demo follow --view": "the same page; tests/end_to_end/test_follow_demo.py runs the demo",
     "quadvel up --view": "tests/quadvel_view/test_page.py opens its page",
     "quadvel view": "the same page, beside a robot that runs",
     "quadvel view out/demo/demo.mcap": "tests/quadvel_view/test_page.py plays one",
@@ -129,6 +130,7 @@ LEFT_OUT = {
     "quadvel twin my_plant.yaml": "the same with a plant of the user's",
     "quadvel eval --grid quick --out out/eval": "minutes; tests/quadvel_eval/test_grid.py runs some of its walks",
     "quadvel eval --grid quick --policy NETWORK.onnx --out out/eval": "the same",
+    "quadvel eval --grid paper --seeds 3 --cluster tcp://scheduler:8786": "needs a cluster; tests/quadvel_eval has one",
     "quadvel bench --out out/bench.json": "minutes, and only of use on an idle machine",
     "quadvel bench --live": "a minute, and only of use on an idle machine",
     "quadvel paper --out docs/results/paper": "an hour; tests/quadvel_eval/test_paper_study.py runs parts of it",
@@ -150,6 +152,7 @@ LEFT_OUT_KINDS = {
     r"export .*": "the same",
     r"(\.venv/bin/)?pip install .*": "needs the network",
     r"ssh .*": "needs another host",
+    r"sudo apt install .*|git clone .*": "needs the network",
     r"(ROS_SECURITY_ENCLAVE_OVERRIDE=\S+ )?ros2 .*": "needs ROS 2; tests/ros runs the launch files there",
     r"\.venv/bin/pytest .*": "these are the tests",
     r"python -m quadvel_training (?!--help).*": "minutes to hours; tests/training runs each stage for some steps",
@@ -176,8 +179,11 @@ def examples() -> dict[str, str]:
 
 
 def _blocks(text: str) -> Iterator[str]:
-    """The lines of indented blocks, which follow an empty line, and of fenced ones but diagrams; continued lines are joined."""
-    text = re.sub(r"^```mermaid\n.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    """The lines of indented blocks, which follow an empty line, and of fenced ones; continued lines are joined.
+
+    Left out are diagrams, and directives of the site: `make docs` runs the cells of its tutorials.
+    """
+    text = re.sub(r"^```(?:mermaid$|\{).*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
     text = re.sub(r" *\\\n *", " ", text)
     inside = fenced = False
     before = ""

@@ -57,7 +57,7 @@ BUILD_TOOLS = {"setuptools"}
 OPTIONAL = {"quadvel_eval", "quadvel_follow", "quadvel_lab", "quadvel_sim", "quadvel_sysid"}
 """What quadvel_bringup names as texts: its commands and nodes refuse to start where it is not installed"""
 HEAVY = {"matplotlib", "mujoco", "numba", "onnx", "scipy", "torch"}
-OF_TOOLS = ("test", "ros", "lint")
+OF_TOOLS = ("docs", "test", "ros", "lint")
 """Extras whose packages no source imports"""
 BY_TORCH = {"onnxscript", "tensorboard"}
 """What torch imports where a training asks it to export and to log"""

@@ -63,7 +63,7 @@ def export(
 ) -> None:
     """Write a network as a one-step ONNX file, atomically.
 
-    The file maps (obs, h_in, c_in) to (*outputs, h_out, c_out).
+    The file maps `(obs, h_in, c_in)` to `(*outputs, h_out, c_out)`.
 
     Args:
         network: the network.
