@@ -50,7 +50,7 @@ SWITCHES: dict[str, dict[str, Any]] = {
     "sharp accelerations": {"sharp_accelerations": False},
     "between rows": {"instants_per_row": 1},
     "losses at random": {"lost_commands_at_random": False},
-    "longest delays": {"longest_delays": False},
+    "central delays": {"central_delays": False},
 }
 """For each switch the fields of `SearchOptions` that it changes."""
 

@@ -1,7 +1,9 @@
 """Benchmark of the identification on logs with undeclared effects (blind test).
 
     python -m tests.identification.score --logs 20 --jobs 2 --out out/identification_score [--kinds cogging,none] [--write]
+    python -m tests.identification.score --logs 4 --generator other --out out/other_score
 
+The second generator (`benchmarks.identification.other_plant`) shares no code with the first one.
 An interrupted run continues where it stopped: the verdict of each log is a file under DIR/cases.
 Delete DIR after a change of the identification.
 """
@@ -23,28 +25,34 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
+from benchmarks.identification.other_plant import cases as other_cases
 from quadvel_sysid.options import DEFAULTS, IdentifyOptions
 from tests.identification import adapter, table
-from tests.identification.hidden.cases import GROUP_OF, make_case
+from tests.identification.hidden import cases as first_cases
 from tests.identification.verdicts import score_report
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "results" / "identification_score.md"
+GENERATORS = {"first": first_cases, "other": other_cases}
 
 
-def score_case(kind: str, index: int, seed: int, options: IdentifyOptions = DEFAULTS) -> dict[str, Any]:
+def score_case(
+    kind: str, index: int, seed: int, options: IdentifyOptions = DEFAULTS, generator: str = "first"
+) -> dict[str, Any]:
     """Generate one log, identify it and score the report.
 
     Args:
-        kind: Kind of log, a key of `GROUP_OF`.
+        kind: Kind of log, a key of the generator's `GROUP_OF`.
         index: Number of the log.
         seed: Seed of the benchmark.
         options: Options of the identification.
+        generator: Name of the generator, a key of `GENERATORS`.
 
     Returns:
         One row of the score. An exception of the identification is a row with `error`.
     """
-    case = make_case(kind, index, seed)
+    cases = GENERATORS[generator]
+    case = cases.make_case(kind, index, seed)
     with TemporaryDirectory() as folder:
         paths = case.save(Path(folder) / "truth")
         shown = [path.rename(Path(folder) / path.name) for path in paths]  # the truth stays in another folder
@@ -54,7 +62,7 @@ def score_case(kind: str, index: int, seed: int, options: IdentifyOptions = DEFA
         except Exception as error:  # any exception is a verdict, and the benchmark continues
             found: dict[str, Any] = {
                 "kind": kind,
-                "group": GROUP_OF[kind],
+                "group": cases.GROUP_OF[kind],
                 "error": f"{type(error).__name__}: {error}",
                 "trace": traceback.format_exc(),
             }
@@ -83,9 +91,9 @@ def engine_commit() -> str:
     return outputs[0].strip() + ("+" if outputs[1] else "")
 
 
-def _work(kind: str, index: int, seed: int, path: Path) -> None:
+def _work(kind: str, index: int, seed: int, generator: str, path: Path) -> None:
     """Score one log into its file."""
-    save_row(score_case(kind, index, seed) | {"engine": engine_commit()}, path)
+    save_row(score_case(kind, index, seed, generator=generator) | {"engine": engine_commit()}, path)
 
 
 def save_row(row: dict[str, Any], path: Path) -> None:
@@ -101,7 +109,13 @@ def save_row(row: dict[str, Any], path: Path) -> None:
 
 
 def run_campaign(
-    kinds: list[str], logs: int, seed: int, jobs: int, out: Path, done: bool = False
+    kinds: list[str],
+    logs: int,
+    seed: int,
+    jobs: int,
+    out: Path,
+    done: bool = False,
+    generator: str = "first",
 ) -> list[dict[str, Any]]:
     """Score all logs that have no file yet.
 
@@ -112,28 +126,30 @@ def run_campaign(
         jobs: Worker processes.
         out: Folder of the verdicts.
         done: Only return existing rows.
+        generator: Name of the generator, a key of `GENERATORS`.
 
     Returns:
         Rows of these kinds, by kind and number.
 
     Raises:
-        BadParameter: If `out` has verdicts of another seed.
+        BadParameter: If `out` has verdicts of another seed or generator.
     """
     folder = out / "cases"
     folder.mkdir(parents=True, exist_ok=True)
     settings = out / "settings.json"
-    if settings.exists() and json.loads(settings.read_text())["seed"] != seed:
-        raise typer.BadParameter(
-            f"{settings}: seed: found {json.loads(settings.read_text())['seed']}, expected {seed}"
-        )
-    settings.write_text(json.dumps({"seed": seed}))
+    expected = {"seed": seed, "generator": generator}
+    found = json.loads(settings.read_text()) if settings.exists() else expected
+    for name, value in expected.items():
+        if found.get(name) != value:
+            raise typer.BadParameter(f"{settings}: {name}: found {found.get(name)}, expected {value}")
+    settings.write_text(json.dumps(expected))
     cases = [(kind, index, folder / f"{kind}-{index:03d}.json") for index in range(logs) for kind in kinds]
     if done:
         cases = [case for case in cases if case[2].exists()]
     missing = [case for case in cases if not case[2].exists()]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-        futures = [pool.submit(_work, kind, index, seed, path) for kind, index, path in missing]
+        futures = [pool.submit(_work, kind, index, seed, generator, path) for kind, index, path in missing]
         for future in track(
             as_completed(futures), "Scoring", total=len(futures), console=Console(stderr=True)
         ):
@@ -150,6 +166,7 @@ def main(
     ] = 20,
     kinds: Annotated[str, typer.Option(help="Kinds or groups, separated by commas (default: all).")] = "",
     seed: int = 0,
+    generator: Annotated[str, typer.Option(help="first or other.")] = "first",
     jobs: int = 2,
     out: Annotated[Path, typer.Option(help="Folder of verdicts, CSV and page.")] = Path(
         "out/identification_score"
@@ -160,14 +177,17 @@ def main(
     write: Annotated[bool, typer.Option("--write", help=f"Also write {PAGE.name} in the docs.")] = False,
 ) -> None:
     """Score the identification on logs with undeclared effects."""
-    asked = kinds.split(",") if kinds else list(GROUP_OF)
-    chosen = [kind for kind in GROUP_OF if kind in asked or GROUP_OF[kind] in asked]
-    unknown = set(asked) - set(GROUP_OF) - set(GROUP_OF.values())
+    if generator not in GENERATORS:
+        raise typer.BadParameter(f"--generator: found {generator}, expected one of {', '.join(GENERATORS)}")
+    groups = GENERATORS[generator].GROUP_OF
+    asked = kinds.split(",") if kinds else list(groups)
+    chosen = [kind for kind in groups if kind in asked or groups[kind] in asked]
+    unknown = set(asked) - set(groups) - set(groups.values())
     if unknown:
         raise typer.BadParameter(
-            f"--kinds: found {', '.join(sorted(unknown))}, expected some of {', '.join(GROUP_OF)}"
+            f"--kinds: found {', '.join(sorted(unknown))}, expected some of {', '.join(groups)}"
         )
-    rows = run_campaign(chosen, logs, seed, jobs, out, done)
+    rows = run_campaign(chosen, logs, seed, jobs, out, done, generator)
     page = table.markdown(rows, seed)
     (out / "score.md").write_text(page)
     table.write_csv(rows, out / "score.csv")

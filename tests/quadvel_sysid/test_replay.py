@@ -134,6 +134,6 @@ def test_logs_are_identified_without_mujoco_and_legs_are_refused(monkeypatch):
     )
     subprocess.run([sys.executable, "-c", program], check=True)
     monkeypatch.setitem(sys.modules, "quadvel_sysid.export.legs", None)
-    dataset = Dataset(train=(_still(),), heldout=(), findings=(), body=None)
+    dataset = Dataset(train=(_still(),), heldout=(), pieces=((0,),), findings=(), body=None)
     with pytest.raises(ValueError, match=r"--robot needs mujoco, .* 'quadvel-core\[sim\]'"):
         find_load(dataset, "go2")

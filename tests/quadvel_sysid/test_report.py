@@ -89,6 +89,7 @@ REPORT: dict[str, Any] = {
         }
     ],
     "warnings": ["stribeck_friction.c is at its bound"],
+    "withheld": [],
 }
 
 
@@ -238,3 +239,12 @@ def test_a_report_without_effects_states_that(tmp_path: Path) -> None:
         "No question is open",
     ):
         assert sentence in text
+
+
+def test_a_withheld_model_is_not_written_unless_forced(tmp_path: Path) -> None:
+    plain = attrs.evolve(identification(), shapes=(), traces={})  # without pictures
+    withheld = attrs.evolve(plain, report={**plain.report, "withheld": ["kp is 0"]})
+    write_report(plain, tmp_path)
+    assert write_report(withheld, tmp_path) == ("report.html", "report.json")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "report.json"]
+    assert write_report(withheld, tmp_path, force=True) == REPORT_FILES

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
-from quadvel_sysid.report.summary_text import summary_text
+from quadvel_sysid.report.summary_text import (
+    leave_one_out,
+    leave_one_out_text,
+    summary_text,
+    withheld_summary,
+)
 
 
 def report(*effects: tuple[str, float]) -> dict[str, Any]:
     return {
         "before": {"heldout_mse": 1.0},
         "after": {"heldout_mse": 0.25, "train_mse": 0.25},
-        "effects": [{"name": name, "p_value": p} for name, p in effects],
-        "unexplained": {"verdict": "white", "depends_on": []},
+        "effects": [{"name": name, "p_value": p, "at_bound": False} for name, p in effects],
+        "unexplained": {"verdict": "white", "depends_on": [], "edges": {"rows": 0.05, "error": 0.1}},
         "noise_floor": 0.2,
     }
 
@@ -30,5 +35,61 @@ def test_an_effect_that_the_reported_rows_do_not_confirm_is_stated_separately() 
     assert "the model contains supply_sag as well, but the reported rows do not confirm it" in text
 
 
-def test_without_a_confirmed_effect_the_selected_effects_are_stated() -> None:
-    assert summary_text(report(("armature", 0.3))).startswith("Add armature:")
+def test_without_a_confirmed_effect_none_is_added() -> None:
+    text = summary_text(report(("armature", 0.3)))
+    assert text.startswith("No effect is confirmed: with armature the held-out error falls, from 1 to 0.25")
+
+
+def test_effects_that_raise_the_held_out_error_are_not_added() -> None:
+    worse = report(("armature", 1e-9)) | {"before": {"heldout_mse": 0.2}}
+    assert summary_text(worse).startswith("No effect is confirmed: with armature the held-out error does not")
+
+
+def test_an_effect_whose_value_is_at_a_bound_is_not_added() -> None:
+    found = report(("armature", 1e-9), ("soft_stop", 1e-9))
+    found["effects"][1]["at_bound"] = True
+    text = summary_text(found)
+    assert text.startswith("Add armature:")
+    assert "the model contains soft_stop as well, but a value of it is at a bound" in text
+
+
+def test_errors_after_changes_of_commands_are_mentioned() -> None:
+    found = report(("armature", 1e-9))
+    found["unexplained"]["edges"]["error"] = 0.79
+    text = summary_text(found)
+    assert "79 % of the remaining error is in the 5 % of the rows where a command has just changed" in text
+
+
+def test_reasons_against_a_result_replace_its_decision() -> None:
+    found = {"decision": "Add armature.", "warnings": ["a"]}
+    assert withheld_summary(found, [], []) == {"withheld": [], **found}
+    implausible = withheld_summary(found, ["kp is 0"], ["a filter is better"])
+    assert implausible["decision"] == "Not a PD-controlled joint as logged: kp is 0; a filter is better."
+    assert implausible["warnings"] == ["a", "kp is 0", "a filter is better"]
+    assert withheld_summary(found, [], ["a filter is better"])["decision"].startswith("No decision:")
+
+
+def test_logs_that_are_left_out_in_turn_show_what_their_models_share() -> None:
+    values = {"delta_kp": 0.0, "delta_kd": 0.0, "input_delay_ms": 5.0, "output_delay_ms": 0.0}
+    folds = []
+    for name, error, effects in (("a", 0.2, ["armature"]), ("b", 0.4, ["armature", "cogging"])):
+        folds.append(
+            {
+                "before": {"heldout_mse": 1.0},
+                "after": {"heldout_mse": error, **values},
+                "baselines": {"ridge": {"heldout_mse": 0.5}},
+                "effects": [{"name": one} for one in effects],
+                "clocks": [
+                    {"log": "other", "command_offset_ms": 0.0},
+                    {"log": name, "command_offset_ms": 0.4},
+                ],
+            }
+        )
+    entry = leave_one_out(folds)
+    assert [(one["log"], one["after"], one["command_offset_ms"]) for one in entry["logs"]] == [
+        ("a", 0.2, 0.4),
+        ("b", 0.4, 0.4),
+    ]
+    text = leave_one_out_text(entry)
+    assert "error 1 before, 0.3 after" in text
+    assert text.endswith("effects of all fits: armature; of some: cogging")

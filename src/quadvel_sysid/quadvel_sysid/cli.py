@@ -38,6 +38,8 @@ MULTI_VALUE_OPTIONS = ("--holdout", "--joints")
 """Options that take several values after one name."""
 DEFAULT_CORES = 2
 """Worker processes unless `--cores` asks for more; each one takes about 200 MB."""
+WITHHELD_EXIT_CODE = 3
+"""Exit code if the decision is withdrawn; actuator.yaml is then written with --force alone."""
 _LONG_LOG_VALUES = 1_000_000
 """Number of values of q (samples times joints) from which logs count as long: freed memory goes
 back to the system, and one worker is the default.
@@ -133,6 +135,9 @@ def identify(
             metavar="<topic>", help="Commands in recordings.", show_default="found by type and name"
         ),
     ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Write actuator.yaml even if the result is not plausible.")
+    ] = False,
     cores: Annotated[
         int | None,
         typer.Option(
@@ -161,7 +166,8 @@ def identify(
     A CSV file has the same fields as columns: t, q/FR_hip_joint, dq/FR_hip_joint, ...
     Other names, units and signs, in a map file: t: {from: timestamp, scale: 1.0e-6}
 
-    Other files in the folder are kept. Ctrl-C leaves the folder unchanged.
+    Other files in the folder are kept. Ctrl-C leaves the folder unchanged. Exit code 3: the result is not that of
+    a PD-controlled joint, or another model predicts better; actuator.yaml is then not written without --force.
     """
     messages = Console(stderr=True)
     try:
@@ -172,7 +178,9 @@ def identify(
         parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
         options = IdentifyOptions(gains=gains, base=parameters, robot=robot)
         found = _identify(logs, holdout or [], read, options, cores, messages)
-        _write(found, out, messages)
+        _write(found, out, force, messages)
+        if found.report["withheld"]:
+            raise typer.Exit(WITHHELD_EXIT_CODE)
     except KeyboardInterrupt:
         messages.print("stopped; nothing was written")
         raise typer.Exit(130) from None
@@ -213,19 +221,22 @@ def _identify(
         return identify_dataset(dataset, attrs.evolve(options, cores=cores), on_progress)
 
 
-def _write(found: Identification, out: Path, messages: Console) -> None:
+def _write(found: Identification, out: Path, force: bool, messages: Console) -> None:
     """Write the report and print a summary."""
     from .report.report import write_report
+    from .report.summary_text import leave_one_out_text
 
-    write_report(found, out)
+    names = write_report(found, out, force)
     console = Console()
     console.print(escape(str(found.report["decision"])), soft_wrap=True, highlight=False)
     console.print(error_line(found.report), soft_wrap=True, highlight=False)
     if "replay" in found.report:
         console.print(replay_line(found.report["replay"]), soft_wrap=True, highlight=False)
+    if "leave_one_out" in found.report:
+        console.print(leave_one_out_text(found.report["leave_one_out"]), soft_wrap=True, highlight=False)
     for text in found.report["warnings"]:
         messages.print(escape(f"warning: {text}"), style=STYLE["warning"], soft_wrap=True, highlight=False)
-    console.print(f"written: {out}/report.html, report.json, actuator.yaml", soft_wrap=True, highlight=False)
+    console.print(f"written: {out}/{', '.join(names)}", soft_wrap=True, highlight=False)
 
 
 def error_line(report: Mapping[str, Any]) -> str:

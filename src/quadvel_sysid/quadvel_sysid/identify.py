@@ -15,25 +15,24 @@ import attrs
 import numpy as np
 
 from quadvel_actuator.parameters import ActuatorParameters
-from quadvel_description.arrays import Bools
 
 from .data.dataset import Dataset, Progress, no_progress
 from .data.noise import noise_variance
 from .data.plain_model import DRIVE_WINDOWS_S
-from .data.preparation import MIN_BLOCK_S, Preprocessed, preprocess
-from .data.split import DataSplit
+from .data.preparation import Preprocessed, preprocess
+from .data.split import MIN_BLOCK_S, DataSplit
 from .export.replay import Load, Replay, find_load
 from .logs.check_log import check_logs
 from .logs.findings import Finding
 from .logs.log import Log
-from .model.delays import longest_equivalent_delay, quantised_delays
+from .model.delays import central_equivalent_delay, quantised_delays
 from .model.fit import fit
 from .model.torque_model import Model
 from .options import DEFAULTS, IdentifyOptions, SearchOptions
 from .report.identification import Identification
-from .report.outcome import Evidence, Outcome, Refit, SelectedEffect, build_identification
-from .report.sanity_checks import contradictions
-from .report.summary_text import motion_summary
+from .report.outcome import Evidence, Outcome, SelectedEffect, build_identification
+from .report.sanity_checks import contradictions, implausibilities
+from .report.summary_text import leave_one_out, motion_summary, withheld_summary
 from .search.fitted_model import FittedModel, ModelEvaluator
 from .search.lost_commands import reassign_losses
 from .search.regressors import RegressorCandidate
@@ -85,7 +84,8 @@ def identify_dataset(
 ) -> Identification:
     """Identify the actuators from checked logs.
 
-    Who prepares the dataset first can release the memory of the full logs.
+    Who prepares the dataset first can release the memory of the full logs. If several logs are
+    fitted and none is held out, each of them is held out in turn as well (leave-one-log-out).
 
     Args:
         dataset: Checked logs, with excerpts of the long ones.
@@ -99,6 +99,20 @@ def identify_dataset(
     Raises:
         LogError: The commands cannot be replayed, or a joint has too few rows.
     """
+    count = 0 if dataset.heldout or len(dataset.pieces) == 1 else len(dataset.pieces)
+
+    def progress_of(part: int) -> Progress:
+        return lambda share, text: progress((part + share) / (count + 1), text)
+
+    found = _identify_once(dataset, options, progress_of(0))
+    if not count:
+        return found
+    folds = [_identify_once(dataset.hold_out(k), options, progress_of(k + 1)).report for k in range(count)]
+    return attrs.evolve(found, report={**found.report, "leave_one_out": leave_one_out(folds)})
+
+
+def _identify_once(dataset: Dataset, options: IdentifyOptions, progress: Progress) -> Identification:
+    """Identify the actuators from one division of the logs."""
     # 1. Samples, data split and plain EAM.
     base = options.base or ActuatorParameters.default()
     load = find_load(dataset, options.robot)
@@ -112,7 +126,7 @@ def identify_dataset(
     searched = search.best(plain)
     best, best_effects = searched.best, searched.best_effects
 
-    # 3. Refit to all rows, and choose between nested models by replays where there is a load.
+    # 3. Refit to all rows that are not reported; replays choose between nested models if there is a load.
     replay = None if load is None else Replay(load, prepared, base)
     progress(0.88, "replays" if replay else "intervals")
     models = [before, best]
@@ -124,22 +138,24 @@ def identify_dataset(
 
     # 4. Intervals and report.
     progress(0.93, "intervals")
-    final_rows = parts.fit_or_select if dataset.heldout else parts.all_rows
-    after = _refit_final_rows(refitted[chosen], final_rows, options.search)
+    after = refitted[chosen]
     outcome = Outcome(
-        before=_refit_final_rows(refitted[before], final_rows, options.search),
+        before=refitted[before],
         after=after,
-        evidence=_evidence(search, searched.record, chosen, after.model, parts),
-        half_widths=intervals(after.all_rows, attrs.evolve(parts, report=parts.report & final_rows)),
+        evidence=_evidence(search, searched.record, chosen, after, parts),
+        half_widths=intervals(after, parts, prepared.clock_offsets),
         noise=evaluator.noise,
         parts=parts,
         base=base,
+        clocks=prepared.clocks,
     )
     found = build_identification(outcome, [*dataset.findings, *notes])
     report = {**found.report, **_comparisons(outcome, replay)}
     if "motion" in report:
         report |= motion_summary(report)
-    report["warnings"] = [*report["warnings"], *contradictions(report)]
+    report |= withheld_summary(
+        report, list(implausibilities(after, parts.report)), list(contradictions(report))
+    )
     progress(1.0, "done")
     return attrs.evolve(found, report=report)
 
@@ -176,21 +192,16 @@ def _step_counter(progress: Progress) -> Callable[[str], None]:
 
 
 def _refit_all_rows(fitted: FittedModel, prepared: Preprocessed) -> Model:
-    """The model refitted to all rows that fit or select."""
+    """The model refitted to all rows that fit or select; the report judges it, and the file holds it."""
     parts, samples, evaluator = prepared.parts, prepared.samples, fitted.evaluator
     model = attrs.evolve(fitted.model, samples=samples)
     if len(samples.t) > len(fitted.model.samples.t):
         model = reassign_losses(model, parts, evaluator.noise)
-    model = fit(model, parts.fit_or_select)
-    return longest_equivalent_delay(model, parts.fit_or_select) if evaluator.options.longest_delays else model
-
-
-def _refit_final_rows(model: Model, rows: Bools, options: SearchOptions) -> Refit:
-    """The model, and its refit to the rows that the reported values follow from."""
-    final = fit(model, rows)
-    if options.longest_delays:
-        final = quantised_delays(longest_equivalent_delay(final, rows), rows)
-    return Refit(model, final)
+    rows = parts.fit_or_select
+    model = fit(model, rows)
+    if not evaluator.options.central_delays:
+        return model
+    return quantised_delays(central_equivalent_delay(model, rows), rows)
 
 
 def _evidence(
@@ -215,7 +226,7 @@ def _comparisons(outcome: Outcome, replay: Replay | None) -> dict[str, Any]:
     """Sections of the report: errors of the baselines, and of replays where there is a load."""
     parts = outcome.parts
     baselines = baseline_errors(outcome.samples, parts.fit_or_select, parts.report)
-    replays = replay.section(outcome.before.model, outcome.after.model) if replay else {}
+    replays = replay.section(outcome.before, outcome.after) if replay else {}
     return {"baselines": baselines, **replays}
 
 

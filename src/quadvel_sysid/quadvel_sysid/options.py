@@ -42,7 +42,7 @@ class SearchOptions:
     kurtosis_test: bool = _switch("test the residual for kurtosis as well as for autocorrelation")
     delay_starts: int = _option(3, "points of the grid of delays from which fits start", (1, 100))
     far_delays: bool = _switch("try delays up to 8 ms from the present ones")
-    longest_delays: bool = _switch("choose the longest equivalent delays, and whole drive steps")
+    central_delays: bool = _switch("choose the middle of equivalent delays, and whole drive steps")
     screening_grid: bool = _switch("screen candidates on a grid of delays")
     memory_cost: float = _option(
         0.5, "further parameters of an effect with memory or one like a delay", (0.0, 10.0)
@@ -77,7 +77,7 @@ class IdentifyOptions:
         (0.0, math.inf),
         "N m/rad, N m s/rad",
     )
-    max_values: int = _option(60_000, "torque values of all logs; longer logs are cut", (1000, 10**9))
+    max_values: int = _option(60_000, "torque values of the fitted logs; longer logs are cut", (1000, 10**9))
     base: ActuatorParameters | None = _option(
         None, "model whose torque limits are kept; None for the default"
     )

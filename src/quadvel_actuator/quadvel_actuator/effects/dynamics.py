@@ -56,6 +56,11 @@ def _previous_row(x: Array, s: Any) -> Array:
     return np.where(s.start, x, np.concatenate([x[..., :1, :], x[..., :-1, :]], axis=-2))
 
 
+def _once_if_shared(time: Array) -> Array:
+    """A time constant (..., J) of one joint (..., 1) if all joints share it, as exponentials take long."""
+    return time[..., :1] if np.ndim(time) and (time == time[..., :1]).all() else time
+
+
 def lag_series(x: Array, s: Any, time: Array) -> Array:
     """Filter rows with a first-order lag, each value held over its step, from rest.
 
@@ -71,6 +76,7 @@ def lag_series(x: Array, s: Any, time: Array) -> Array:
     # starts. This is a lower bidiagonal system; all joints and guesses are solved as one.
     from scipy.linalg.blas import dtbsv  # nodes, which do not filter rows, start without SciPy
 
+    time = _once_if_shared(time)
     gone = np.where(s.start, -1.0, np.expm1(-s.dt / time))  # d - 1
     gone[..., 0, :] = -1.0
     gone, x = (one.swapaxes(-1, -2) for one in np.broadcast_arrays(gone, x))  # (..., J, N)
@@ -104,9 +110,9 @@ class FirstOrderLag(MemoryEffect):
         # before.
         # Both parts together equal a constant input before + w (x - before), with
         #     w = (1 - exp(-age / T)) / (1 - exp(-dt / T))
-        before = _previous_row(x, s)
-        late = -np.expm1(-np.minimum(s.age, s.dt) / p["T"]) / -np.expm1(-s.dt / p["T"])
-        return lag_series(before + late * (x - before), s, p["T"])
+        before, time = _previous_row(x, s), _once_if_shared(p["T"])
+        late = -np.expm1(-np.minimum(s.age, s.dt) / time) / -np.expm1(-s.dt / time)
+        return lag_series(before + late * (x - before), s, time)
 
 
 class VelocityFilter(MemoryEffect):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import chain
+from itertools import chain, pairwise
 
 import attrs
+import numpy as np
 
 from ..logs.check_log import CheckedLog
 from ..logs.excerpts import cut_excerpts
@@ -15,6 +16,8 @@ from .motion import Body, imply_torque
 
 Progress = Callable[[float, str], None]
 """Callback that receives the completed fraction (0 to 1) and the next step."""
+_MAX_JUDGED_VALUES = 1_000_000
+"""Torque values of the held-out logs that are judged; longer logs are cut, to bound the memory."""
 
 
 def no_progress(share: float, text: str) -> None:
@@ -35,12 +38,14 @@ class Dataset:
     Attributes:
         train: Logs or excerpts to fit.
         heldout: Logs or excerpts to report on; empty if blocks of `train` are reported on.
+        pieces: For each recording, the indices of its excerpts in `logs`.
         findings: Findings of the checks, as (log name, finding).
         body: Load of the joints, where the torque is inferred from the motion; None otherwise.
     """
 
     train: tuple[Log, ...]
     heldout: tuple[Log, ...]
+    pieces: tuple[tuple[int, ...], ...]
     findings: tuple[tuple[str, Finding], ...]
     body: Body | None
 
@@ -48,6 +53,48 @@ class Dataset:
     def logs(self) -> tuple[Log, ...]:
         """All logs, those to fit first."""
         return (*self.train, *self.heldout)
+
+    def is_heldout(self, recording: int) -> bool:
+        """Return whether a recording is held out.
+
+        Args:
+            recording: Index of the recording.
+
+        Returns:
+            True if none of its rows are fitted.
+        """
+        return self.pieces[recording][0] >= len(self.train)
+
+    def hold_out(self, recording: int) -> Dataset:
+        """Hold out one of several fitted recordings.
+
+        Args:
+            recording: Index of the recording.
+
+        Returns:
+            A dataset that fits the others and reports on this one.
+        """
+        order = [*(k for k in range(len(self.pieces)) if k != recording), recording]
+        logs = [tuple(self.train[k] for k in self.pieces[one]) for one in order]
+        ends = np.cumsum([0, *map(len, logs)]).tolist()
+        return attrs.evolve(
+            self,
+            train=tuple(chain(*logs[:-1])),
+            heldout=logs[-1],
+            pieces=tuple(tuple(range(a, b)) for a, b in pairwise(ends)),
+        )
+
+    def with_logs(self, logs: Sequence[Log]) -> Dataset:
+        """Replace the logs, as after a change of their stamps.
+
+        Args:
+            logs: One for each of `logs`, in the same order.
+
+        Returns:
+            A new dataset.
+        """
+        count = len(self.train)
+        return attrs.evolve(self, train=tuple(logs[:count]), heldout=tuple(logs[count:]))
 
     @classmethod
     def prepare(
@@ -62,7 +109,7 @@ class Dataset:
         Args:
             train: Checked logs to fit, at least one.
             heldout: Checked logs to report on.
-            max_values: Maximum number of torque values to use, over all logs and joints.
+            max_values: Maximum number of torque values to fit, over all fitted logs and joints.
             progress: Receives the completed fraction and the next step.
 
         Returns:
@@ -76,11 +123,21 @@ class Dataset:
             progress(0.01, "the torque that the motion implies")
             logs[0], body = imply_torque(logs[0])
             logs[1:] = [imply_torque(log, body)[0] for log in logs[1:]]
-        count, rows = len(train), max_values // (len(logs) * len(logs[0].joints))
-        # One script may have generated all logs. Excerpts of held-out logs therefore lie between
-        # those of the fitted logs in time.
-        excerpts = [cut_excerpts(log, rows * log.period, between=k >= count) for k, log in enumerate(logs)]
-        findings = tuple(
-            (checked.log.name, one) for checked in (*train, *heldout) for one in checked.findings
+        count, joints = len(train), len(logs[0].joints)
+        limits = [max_values // (count * joints)] * count
+        limits += [_MAX_JUDGED_VALUES // (max(len(heldout), 1) * joints)] * len(heldout)
+        excerpts = [cut_excerpts(log, rows * log.period) for log, rows in zip(logs, limits, strict=True)]
+        ends = np.cumsum([0, *map(len, excerpts)]).tolist()
+        findings = [(checked.log.name, one) for checked in (*train, *heldout) for one in checked.findings]
+        for k, (log, cut) in enumerate(zip(logs, excerpts, strict=True)):
+            if len(cut) > 1:
+                seconds, verb = sum(one.duration for one in cut), "fitted" if k < count else "judged"
+                text = f"t: {len(cut)} excerpts, {seconds:.1f} of {log.duration:.1f} s, are {verb}"
+                findings.append((log.name, Finding("note", "t", (), text)))
+        return cls(
+            tuple(chain(*excerpts[:count])),
+            tuple(chain(*excerpts[count:])),
+            tuple(tuple(range(a, b)) for a, b in pairwise(ends)),
+            tuple(findings),
+            body,
         )
-        return cls(tuple(chain(*excerpts[:count])), tuple(chain(*excerpts[count:])), findings, body)

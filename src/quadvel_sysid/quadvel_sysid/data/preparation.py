@@ -12,24 +12,18 @@ from collections.abc import Callable, Sequence
 import attrs
 import numpy as np
 
-from ..logs.excerpts import has_jitter, restore_even_clock
 from ..logs.findings import Finding
-from ..logs.log import Log, LogError
+from ..logs.log import LogError
 from ..options import SEARCH_DEFAULTS, SearchOptions
+from .clocks import RecordingClock, align_commands, choose_stamps, clock_findings
 from .dataset import Dataset
-from .noise import encoder_variance, noise_variance
+from .noise import noise_variance
 from .plain_model import Eam, fit_eam
 from .signals import Samples
-from .split import DataSplit, cluster_starts
+from .split import MIN_BLOCK_S, DataSplit, block_length, cluster_starts, reported_rows
 
-_MIN_BLOCKS = 20
-"""Blocks of a log, at least."""
-MIN_BLOCK_S, _MAX_BLOCK_S = 0.2, 2.0
-"""s; shortest and longest duration of the blocks that are fitted, used for selection, or held out."""
 _MIN_ROWS = 20
 """Rows of each joint and part, at least."""
-_EVEN_CLOCK_ERROR_RATIO = 0.97
-"""The even clock is used if it leaves at most this share of the error."""
 _ENCODER_NOISE_SHARE = 0.01
 """Encoders are noisy if their noise adds at least this share of the torque's noise variance."""
 _AVERAGING_ROWS = np.array([1, 2, 4, 8])
@@ -52,11 +46,18 @@ class Preprocessed:
         samples: Rows of all logs, N rows of J joints.
         parts: Which rows are fitted, used for selection, or held out.
         eam: The plain actuator model.
+        clocks: Clock of each recording.
     """
 
     samples: Samples
     parts: DataSplit
     eam: Eam
+    clocks: tuple[RecordingClock, ...]
+
+    @property
+    def clock_offsets(self) -> tuple[float, ...]:
+        """Known offsets of the recordings' commands, s."""
+        return tuple(one.offset_s for one in self.clocks if one.offset_s is not None)
 
 
 def preprocess(
@@ -65,7 +66,7 @@ def preprocess(
     shortest: float = MIN_BLOCK_S,
     options: SearchOptions = SEARCH_DEFAULTS,
 ) -> tuple[Preprocessed, list[tuple[str, Finding]]]:
-    """Choose the time stamps and the averaging that explain the torque best.
+    """Correct the clocks of each recording, and choose the averaging that explains the torque best.
 
     Args:
         dataset: The logs.
@@ -76,42 +77,36 @@ def preprocess(
     Returns:
         The preprocessed logs, and a note for each choice other than the logs as they are.
     """
+    length = block_length(dataset, shortest)
+    dataset, clocks = choose_stamps(dataset, windows, length, options)
+    dataset, clocks = align_commands(dataset, clocks, windows, length)
 
-    def fit_logs(logs: Sequence[Log], steady: float = 0.0) -> Preprocessed:
-        samples = Samples.of(logs, steady, options)
-        parts = split_rows(samples, dataset, shortest, options.cluster_motion_rad)
-        return Preprocessed(samples, parts, fit_eam(samples, parts.fit, windows=windows))
+    def fit_logs(steady: float) -> Preprocessed:
+        samples = Samples.of(dataset.logs, steady, options)
+        parts = split_rows(samples, dataset, length, options.cluster_motion_rad)
+        return Preprocessed(samples, parts, fit_eam(samples, parts.fit, windows=windows), tuple(clocks))
 
-    logs: Sequence[Log] = dataset.logs
-    prepared, notes = fit_logs(logs), []
-    if options.even_clocks and any(has_jitter(log) for log in logs):
-        even = [restore_even_clock(log) for log in logs]
-        other = fit_logs(even)
-        if other.eam.mse <= _EVEN_CLOCK_ERROR_RATIO * prepared.eam.mse:
-            logs, prepared = even, other
-            text = "the even clock of the sender explains the torque better and was restored"
-            notes.append(("t", f"t: the stamps jitter as those of received messages do; {text}"))
-    steady = 0.0
+    prepared, steady, notes = fit_logs(0.0), 0.0, clock_findings(dataset, clocks)
     if options.averaged_encoders:
-        prepared, steady = _choose_averaging(prepared, lambda steady: fit_logs(logs, steady))
+        prepared, steady = _choose_averaging(prepared, fit_logs)
     if steady:
         text = f"is averaged out over {1e3 * steady:.3g} ms to either side"
-        notes.append(("dq", f"q, dq: their noise, on which the drive did not act, {text}"))
-    return prepared, [(logs[0].name, Finding("note", field, (), text)) for field, text in notes]
+        text = f"q, dq: their noise, on which the drive did not act, {text}"
+        notes.append((dataset.logs[0].name, Finding("note", "dq", (), text)))
+    return prepared, notes
 
 
 def split_rows(
-    samples: Samples, dataset: Dataset, shortest: float, motion: float = SEARCH_DEFAULTS.cluster_motion_rad
+    samples: Samples, dataset: Dataset, length: float, motion: float = SEARCH_DEFAULTS.cluster_motion_rad
 ) -> DataSplit:
     """Divide the rows into blocks that are fitted, used for selection, or held out.
 
-    Of five consecutive blocks, two are fitted, two are used for selection and one is held out. If
-    there are held-out logs, these alone are held out.
+    Of the blocks that `reported_rows` leaves, half are fitted and half are used for selection.
 
     Args:
         samples: Rows of all logs.
         dataset: The logs.
-        shortest: Shortest block, s.
+        length: Length of the blocks, s.
         motion: Motion of some joint that ends a cluster, rad.
 
     Returns:
@@ -120,15 +115,14 @@ def split_rows(
     Raises:
         LogError: A joint has too few rows in one part.
     """
-    spans = [log.duration for log in samples.logs]
-    length = float(np.clip(min(spans) / _MIN_BLOCKS, shortest, _MAX_BLOCK_S))
     block = np.floor(samples.t / length).astype(int)
-    if dataset.heldout:
-        report = samples.log_of_row >= len(dataset.train)
-        select = (block % 2 == 1) & ~report
-    else:
-        report, select = block % 5 == 4, np.isin(block % 5, (1, 3))
-    rows = {"fitted": ~(select | report), "selecting": select, "reported": report}
+    report, used = np.zeros((2, len(block)), dtype=bool)
+    for recording, pieces in enumerate(dataset.pieces):
+        mine = np.isin(samples.log_of_row, pieces)
+        report[mine] = reported_rows(dataset, recording, samples.t[mine], length)
+        used[mine] = not dataset.is_heldout(recording)
+    select = block % 2 == 1 if dataset.heldout else np.isin(block % 5, (1, 3))
+    rows = {"fitted": used & ~(select | report), "selecting": used & select & ~report, "reported": report}
     parts = {word: samples.evaluated & chosen[:, None] for word, chosen in rows.items()}
     for word, chosen in parts.items():
         count = chosen.sum(axis=0)
@@ -152,12 +146,12 @@ def _choose_averaging(
 ) -> tuple[Preprocessed, float]:
     """Average q and dq over wider windows while this reduces the error; return the half width, s."""
     samples, parts, eam = prepared.samples, prepared.parts, prepared.eam
-    rows, gains = parts.fit_or_select, np.ones(2) if samples.commanded else eam.gains.mean(axis=1)
+    rows = parts.fit_or_select
     noise = noise_variance(samples, rows, samples.tau - eam.predict(samples)).mean()
-    noisy = (
-        encoder_variance(samples, rows, *gains * samples.reference_gains).mean()
-        >= _ENCODER_NOISE_SHARE * noise
-    )
+    gains = np.ones(2) if samples.commanded else eam.gains.mean(axis=1)
+    kp, kd = gains * samples.reference_gains
+    q_noise, dq_noise = samples.sources.encoder_noise
+    noisy = (kp**2 * q_noise + kd**2 * dq_noise).mean() >= _ENCODER_NOISE_SHARE * noise
 
     def error_of(prepared: Preprocessed) -> float:
         """Error with friction; relative to the error without it if noise hardly affects the PD law."""

@@ -20,6 +20,7 @@ from quadvel_description.arrays import Array, Bools, Indices
 
 from ..logs.log import Log
 from ..options import SEARCH_DEFAULTS, SearchOptions
+from .differences import difference_variance
 from .log_signals import ALL_JOINTS, Joints, LogSignals, as_double
 
 Made = TypeVar("Made")
@@ -33,7 +34,7 @@ _MAX_CACHED_VALUES = 400_000
 """Values of one signal in all cached sets together, about."""
 
 _ROW_FIELDS = ("log_of_row", "t", "tau", "start", "dt", "evaluated", "row", "lead")
-_JOINT_FIELDS = ("q", "dq", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature")
+_JOINT_FIELDS = ("q", "dq", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature", "averaging")
 
 _GOLDEN_RATIO = 0.5 * (np.sqrt(5.0) - 1.0)
 """The fractional parts of its multiples fill the unit interval evenly and without a period."""
@@ -61,6 +62,8 @@ class Signals:
             step.
         row: (N, 1) index of the row, counted over all logs.
         sent: (M, J) q_des of every command row of all logs, rad.
+        averaging: Share by which the interpolation between rows reduces the variance of encoder noise:
+            0 on a row, 0.5 halfway between two.
         read_shifted: Function of a signal's name and a delay (s) that reads the signal at another
             time.
         slope: Function of an acceleration's name that computes it.
@@ -82,6 +85,7 @@ class Signals:
     age: Array
     row: Indices
     sent: Array
+    averaging: Array
     read_shifted: Callable[[str, Array], Array]
     slope: Callable[[str], Array]
 
@@ -208,6 +212,17 @@ class Sources:
             _constant_signals([one.signals for one in series]),
         )
 
+    @cached_property
+    def encoder_noise(self) -> tuple[Array, Array]:
+        """Variance of the white noise of q (J,), rad^2, and of dq (J,), rad^2/s^2."""
+        every = np.ones((self.first_row[len(self.series)], self.sent.shape[1]), dtype=bool)
+        start = np.concatenate([_stretches(one.log)[0] for one in self.series])
+        q, dq = (
+            difference_variance(np.concatenate([one.states[name] for one in self.series]), every, start)
+            for name in ("q", "dq")
+        )
+        return q, dq
+
     def first(self, count: int) -> Sources:
         """Keep the first logs.
 
@@ -331,8 +346,11 @@ class Samples:
         count = int(self.log_of_row[np.flatnonzero(rows.any(axis=1))[-1]]) + 1 if rows.any() else 1
         if count == len(self.sources.series):
             return self
-        part = self.take_rows(np.flatnonzero(self.log_of_row < count))
-        return attrs.evolve(part, sources=self.sources.first(count))
+        key = f"first {count} logs".encode()
+        if key not in self._selections:
+            part = self.take_rows(np.flatnonzero(self.log_of_row < count))
+            self._selections[key] = attrs.evolve(part, sources=self.sources.first(count))
+        return self._selections[key]
 
     def thinned(self, step: int) -> tuple[Samples, Indices]:
         """Keep one of every few rows; the signals between them stay known.
@@ -541,6 +559,9 @@ class Samples:
                         one.state_at(name, at, ALL_JOINTS if joints is None else joints, found)
                     )
                 parts.setdefault("t", []).append((at - one.origin)[:, None])
+                # (1 - s) a + s b has the variance ((1 - s)^2 + s^2) var = (1 - 2 s (1 - s)) var.
+                between = found[1]
+                parts.setdefault("averaging", []).append((2.0 * between * (1.0 - between))[:, None])
             return {name: _collapse_constant(np.concatenate(part)) for name, part in parts.items()}
 
         key = (output_delay, *(joints or ()))

@@ -11,11 +11,56 @@ import numpy as np
 
 from quadvel_description.arrays import Array, Bools, Indices
 
+from ..logs.excerpts import has_jitter
 from ..options import SEARCH_DEFAULTS
+from .dataset import Dataset
 from .signals import Samples
 
 CLUSTER_DURATION_S = 0.1
 """Duration, s, over which sums of residuals count as independent."""
+_MIN_BLOCKS = 20
+"""Blocks of a log, at least."""
+MIN_BLOCK_S, _MAX_BLOCK_S = 0.2, 2.0
+"""s; shortest and longest duration of the blocks that are fitted, used for selection, or held out."""
+
+
+def block_length(dataset: Dataset, shortest: float = MIN_BLOCK_S) -> float:
+    """Choose the length of the blocks.
+
+    Args:
+        dataset: The logs.
+        shortest: Shortest block, s.
+
+    Returns:
+        Length, s.
+    """
+    spans = [log.duration for log in dataset.train]
+    return float(np.clip(min(spans) / _MIN_BLOCKS, shortest, _MAX_BLOCK_S))
+
+
+def reported_rows(dataset: Dataset, recording: int, t: Array, length: float) -> Bools:
+    """Return which rows of a recording are reported.
+
+    Of five consecutive blocks, one is reported. If there are held-out logs, these alone are. Where
+    the stamps of a held-out recording have to be corrected, a fifth of it serves this purpose, and
+    the other rows are reported.
+
+    Args:
+        dataset: The logs.
+        recording: Index of the recording.
+        t: Times of its rows, (N,), s.
+        length: Length of the blocks of fitted logs, s.
+
+    Returns:
+        (N,) bool; these rows neither fit, nor select, nor correct stamps.
+    """
+    if not dataset.heldout:
+        return np.asarray(np.floor(t / length) % 5 == 4)
+    if not dataset.is_heldout(recording):
+        return np.zeros(len(t), dtype=bool)
+    if not any(log.has_own_command_stamps or has_jitter(log) for log in dataset.logs):
+        return np.ones(len(t), dtype=bool)
+    return np.asarray(np.floor(t / MIN_BLOCK_S) % 5 != 2)
 
 
 @attrs.frozen(eq=False)

@@ -21,7 +21,11 @@ from ..search.regressors import RegressorCandidate
 
 
 def actuator_parameters(
-    model: Model, parts: DataSplit, base: ActuatorParameters, widths: Sequence[Array] = ()
+    model: Model,
+    parts: DataSplit,
+    base: ActuatorParameters,
+    widths: Sequence[Array] = (),
+    clock_offsets: Sequence[float] = (),
 ) -> ActuatorParameters:
     """Convert a fitted model to actuator parameters.
 
@@ -31,20 +35,25 @@ def actuator_parameters(
         base: Parameters whose torque limits are kept.
         widths: Half widths of the 95 % intervals of each effect's values, (P, J) each; without them
             the effects have no ranges.
+        clock_offsets: Offsets of the recordings' commands, s.
 
     Returns:
-        Parameters with gains, one pair of delays, torque noise and effects.
+        Parameters with gains, one pair of delays (and one for each offset, as the recordings are
+        equally probable), torque noise and effects.
     """
     joints = model.samples.joints
     error = mean_square(model.predictive().residual(), parts.fit_or_select)
-    pair = DelayPair(*running_delays(model, parts.fit_or_select), error)
+    input_delay, output_delay = running_delays(model, parts.fit_or_select)
+    pairs = [
+        DelayPair(max(input_delay + offset, 0.0), output_delay, error) for offset in (0.0, *clock_offsets)
+    ]
     deltas, own = _gain_parameters(model)
     return attrs.evolve(
         base,
         name="identified",
         joints=joints,
         torque_limit=torque_limits(base, joints),
-        pairs=(pair,),
+        pairs=tuple(dict.fromkeys(pairs)),
         torque_noise=error,
         effects=(*_named_effects(model, widths), *_regressor_effect(model, parts.fit), *own),
         **deltas,

@@ -36,13 +36,12 @@ _PERIOD_ROWS = 200
 """Rows over which the true period is estimated."""
 
 
-def cut_excerpts(log: Log, seconds: float, between: bool = False) -> list[Log]:
+def cut_excerpts(log: Log, seconds: float) -> list[Log]:
     """Cut excerpts out of a log, spread evenly over its length.
 
     Args:
         log: The log.
         seconds: Total duration of the excerpts, s; a log that is no longer is returned whole.
-        between: Return the stretches between these excerpts instead.
 
     Returns:
         The excerpts.
@@ -57,8 +56,7 @@ def cut_excerpts(log: Log, seconds: float, between: bool = False) -> list[Log]:
         PIECE_S, *(ROW_RESERVE * least * period for least, period in zip(MIN_PIECE_ROWS, usual, strict=True))
     )
     count = max(int(seconds / length), 1)
-    places = np.linspace(float(log.t[0]), float(log.t[-1]) - length, max(2 * count - 1, 2))
-    starts = places[1::2] if between else places[::2]
+    starts = np.linspace(float(log.t[0]), float(log.t[-1]) - length, max(2 * count - 1, 2))[::2]
     found = [one for start in starts if (one := _cut(log, start, start + length)) is not None]
     if not found:
         raise LogError(

@@ -121,6 +121,11 @@ class Log:
         return float(np.median(np.diff(self.t)))
 
     @property
+    def has_own_command_stamps(self) -> bool:
+        """Whether commands have other stamps than states."""
+        return len(self.t) != len(self.t_cmd) or bool((self.t != self.t_cmd).any())
+
+    @property
     def after_gap(self) -> Bools:
         """State rows (N,) that follow a gap."""
         after: Bools = np.diff(self.t, prepend=self.t[0]) > GAP_FACTOR * self.period

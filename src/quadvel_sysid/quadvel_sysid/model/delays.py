@@ -26,32 +26,34 @@ _REFINEMENT_STEPS_S = (0.25 * DRIVE_STEP_S, 0.125 * DRIVE_STEP_S, 0.0625 * DRIVE
 _ROUND_OFF_STEPS = 1e-6  # of a step
 
 
-def longest_equivalent_delay(model: Model, rows: Bools) -> Model:
-    """Increase the input delays as far as the prediction does not change.
+def central_equivalent_delay(model: Model, rows: Bools) -> Model:
+    """Move the input delays to the middle of the range in which the prediction does not change.
 
-    A drive on the grid of the stamps has the longest of the equivalent delays.
+    At an edge of that range a little jitter moves rows across the steps of commands.
 
     Args:
         model: The fitted model.
         rows: Samples on which the error must not change, (N, J) bool.
 
     Returns:
-        The model with the longest equivalent input delays.
+        The model with the central input delays.
     """
-    return _move_while_equivalent(model, rows, _DELAY_STEP_S)
+    low, high = (_move_while_equivalent(model, rows, by).delays for by in (-_DELAY_STEP_S, _DELAY_STEP_S))
+    return model.with_delays(0.5 * (low + high)) if (low != high).any() else model
 
 
 def delay_flatness(model: Model, rows: Bools) -> float:
-    """Return how far the input delays can decrease without a change of the error.
+    """Return how far the input delays can change without a change of the error.
 
     Args:
         model: The fitted model.
         rows: Samples on which the error must not change, (N, J) bool.
 
     Returns:
-        Largest decrease over the joints, s.
+        Largest change over the joints, in either direction, s.
     """
-    return float((model.delays[0] - _move_while_equivalent(model, rows, -5 * _DELAY_STEP_S).delays[0]).max())
+    moved = (_move_while_equivalent(model, rows, by * _DELAY_STEP_S) for by in (-5, 5))
+    return max(float(np.abs(model.delays[0] - one.delays[0]).max()) for one in moved)
 
 
 def _move_while_equivalent(model: Model, rows: Bools, by: float) -> Model:
@@ -69,7 +71,7 @@ def _move_while_equivalent(model: Model, rows: Bools, by: float) -> Model:
 
 
 def quantised_delays(model: Model, rows: Bools) -> Model:
-    """Round the delays to whole steps of the drive's clock, if the data allow it.
+    """Round the output delay and the sum of both to whole steps of the drive's clock, if the data allow it.
 
     The likelihood-ratio test accepts the rounded delays if they increase the sum of squares by less
     than the 99 % quantile of chi-squared with two degrees of freedom.
@@ -83,10 +85,15 @@ def quantised_delays(model: Model, rows: Bools) -> Model:
     """
     # Likelihood-ratio test of 2 restrictions (both delays): with the noise variance s^2 = SSE / n,
     # (SSE_rounded - SSE) / s^2 has a chi-squared distribution with 2 degrees of freedom.
-    rounded = fit(model.with_delays(np.round(model.delays / DRIVE_STEP_S) * DRIVE_STEP_S), rows, delays=False)
+    total, output = model.delays.sum(axis=0) / DRIVE_STEP_S, np.round(model.delays[1] / DRIVE_STEP_S)
     error = squared_error(model, rows)
     allowed = _CHI2_99 * error / max(int(rows.sum()), 1)
-    return rounded if squared_error(rounded, rows) < error + allowed else model
+    for steps in (np.round(total), np.ceil(total)):
+        delays = np.stack([np.maximum(steps - output, 0.0), output]) * DRIVE_STEP_S
+        rounded = fit(model.with_delays(delays), rows, delays=False)
+        if squared_error(rounded, rows) < error + allowed:
+            return rounded
+    return model
 
 
 def running_delays(model: Model, rows: Bools) -> tuple[float, float]:

@@ -1,6 +1,6 @@
 """Bounded nonlinear least squares for the parameters of a model (Levenberg-Marquardt).
 
-`fit` minimises the squared residual over gains, delays and effect parameters. `fit_delay_profile`
+`fit` minimises `squared_error` over gains, delays and effect parameters. `fit_delay_profile`
 repeats it from a grid of delays, as the error has several local minima along them. Every joint has
 its own small Jacobian block, so that the normal equations stay small for any number of rows.
 """
@@ -19,7 +19,7 @@ from quadvel_description.arrays import Array, Bools
 
 from ..options import SEARCH_DEFAULTS, SearchOptions
 from ..parallel import parallel_map
-from .jacobian import Unknowns, jacobian, pack, with_slots
+from .jacobian import DELAY_STEP_S, Unknowns, jacobian, pack, with_slots
 from .torque_model import MAX_DELAYS_S, Model
 
 _CONVERGED = 2e-5
@@ -62,9 +62,12 @@ def fit(model: Model, rows: Bools, iterations: int = 12, delays: bool = True) ->
 
 
 def _fitted_rows_only(model: Model, rows: Bools) -> tuple[Model, Bools]:
-    """The model on the fitted rows and their mask; on all rows if an effect has memory."""
+    """The model on the fitted rows and their mask; on whole logs if an effect has memory."""
     used: Bools = np.asarray(rows.any(axis=1))
-    if used.all() or any(effect.candidate.has_memory for effect in model.effects):
+    if any(effect.candidate.has_memory for effect in model.effects):
+        samples = model.samples.drop_heldout(rows)
+        return attrs.evolve(model, samples=samples), rows[: len(samples.t)]
+    if used.all():
         return model, rows
     return attrs.evolve(model, samples=model.samples.select_rows(used)), rows[used]
 
@@ -154,17 +157,16 @@ def canonical(model: Model) -> Model:
 
 
 def squared_error(model: Model, rows: Bools) -> float:
-    """Sum the squared residuals over a set of rows.
+    """Sum the squared residuals over a set of rows, and the encoder noise that interpolation averaged.
 
     Args:
         model: The model.
         rows: Samples to sum, (N, J) bool.
 
     Returns:
-        Sum of squared errors, N^2 m^2.
+        Sum of squared errors as all delays would have it without averaging, N^2 m^2.
     """
-    residual = np.where(rows, model.residual(), 0.0)
-    return float(np.sum(residual * residual))
+    return float(np.sum(model.residual() ** 2 + model.averaged_noise(), where=rows))
 
 
 def normal_equations(model: Model, unknowns: Unknowns, rows: Bools) -> tuple[Array, Array, Array, Array]:
@@ -195,7 +197,7 @@ def _damped_step(model: Model, unknowns: Unknowns, rows: Bools, error: float) ->
     theta = pack(model)
     x = unknowns.vector(theta)
     penalty = _weight_penalty(model, unknowns, hessian)
-    hessian, gradient = hessian + penalty, gradient - penalty @ x
+    hessian, gradient = hessian + penalty, gradient - penalty @ x - _averaging_gradient(model, unknowns, rows)
     diagonal = np.diagonal(hessian) + 1e-12 * (1.0 + np.diagonal(hessian).max(initial=0.0))
     for damping in _DAMPING_FACTORS:
         change = _bounded_minimum(
@@ -211,6 +213,17 @@ def _damped_step(model: Model, unknowns: Unknowns, rows: Bools, error: float) ->
         if moved_error < error:
             return moved, moved_error
     return None
+
+
+def _averaging_gradient(model: Model, unknowns: Unknowns, rows: Bools) -> Array:
+    """Half the derivative (K,) of the averaged encoder noise, which depends on the output delays."""
+    local = np.zeros(unknowns.index.shape[::-1])
+    if (unknowns.index[-1] >= 0).any():
+        step = np.array([[0.0], [DELAY_STEP_S]])
+        high, low = model.with_delays(model.delays + step), model.with_delays(model.delays - step)
+        change = np.sum(high.averaged_noise() - low.averaged_noise(), axis=0, where=rows)
+        local[:, -1] = 0.5 * change / (high.delays - low.delays)[1]
+    return unknowns.accumulate(local)
 
 
 def _weight_penalty(model: Model, unknowns: Unknowns, hessian: Array) -> Array:

@@ -94,6 +94,20 @@ class Model:
         residual: Array = self.samples.tau - self.predict()
         return residual
 
+    def averaged_noise(self) -> Array:
+        """Return the variance of encoder noise that interpolation between rows removes from the residual.
+
+        Measured states hold noise that the drive did not act on. A delay halfway between two rows
+        averages it, and so has a smaller error than one on a row, without being better.
+
+        Returns:
+            Variance that a fair comparison of delays adds to the squared residual, (N, J), N^2 m^2.
+        """
+        # tau holds g_p kp e_q + g_d kd e_dq, with the noise e of q and dq at the instant u.
+        s, (q_noise, dq_noise) = self.signals, self.samples.sources.encoder_noise
+        noise: Array = (self.gains[0] * s.kp) ** 2 * q_noise + (self.gains[1] * s.kd) ** 2 * dq_noise
+        return noise * s.averaging
+
     def evaluate(self, gains: Array, values: Sequence[Array]) -> Array:
         """Predict the torque for a batch of parameter values.
 

@@ -11,8 +11,9 @@ import numpy as np
 
 from quadvel_actuator.effects.basis_regressors import LEARNED_RESIDUAL
 from quadvel_actuator.parameters import ActuatorParameters
-from quadvel_description.arrays import Array
+from quadvel_description.arrays import Array, Bools
 
+from ..data.clocks import RecordingClock
 from ..data.plain_model import pd_torque
 from ..data.signals import Samples
 from ..data.split import DataSplit
@@ -32,7 +33,13 @@ from ..model.torque_model import Model
 from ..search.regressors import RegressorCandidate
 from ..statistics.baselines import explained_share, torque_variance
 from ..statistics.confidence import Intervals
-from ..statistics.criterion import SIGNIFICANCE_LEVEL, WHITENESS_LEVEL, normality_p_values, whiteness_p_values
+from ..statistics.criterion import (
+    MIN_EFFECT_SIZE,
+    SIGNIFICANCE_LEVEL,
+    WHITENESS_LEVEL,
+    normality_p_values,
+    whiteness_p_values,
+)
 from .identification import Identification, Shape, Trace
 from .summary_text import summary_text
 
@@ -41,6 +48,8 @@ SCHEMA = 1
 _DELTAS = "delta_kp", "delta_kd"
 UNITS = {"mse": "N^2 m^2", "torque": "N m", "delta_kp": "N m/rad", "delta_kd": "N m s/rad", "delay": "ms"}
 """Units of the report's numbers."""
+_EDGE_S, _MIN_STEP_RAD = 0.004, 1e-4
+"""Time after a change of a command, s, whose error is stated, and the least change, rad."""
 _MIN_REMOVABLE = 0.05
 """Minimum error of the plain EAM above the noise floor, relative to it, to state a fraction."""
 
@@ -86,19 +95,6 @@ class Evidence:
     correlates: tuple[str, ...]
 
 
-@attrs.frozen(eq=False)
-class Refit:
-    """A model, refitted.
-
-    Attributes:
-        model: Fitted to the fitted and selection rows.
-        all_rows: Fitted to every row.
-    """
-
-    model: Model
-    all_rows: Model
-
-
 @attrs.frozen(eq=False, kw_only=True)
 class Outcome:
     """Results of all steps of an identification.
@@ -107,43 +103,45 @@ class Outcome:
         before: Plain EAM.
         after: Corrected model.
         evidence: Evidence for and against effects.
-        half_widths: 95 % confidence intervals of `after.all_rows`.
+        half_widths: 95 % confidence intervals of `after`.
         noise: Variance of the torque noise, (J,), N^2 m^2.
         parts: Data split.
         base: Parameters that the corrected model extends.
+        clocks: Clock of each recording.
     """
 
-    before: Refit
-    after: Refit
+    before: Model
+    after: Model
     evidence: Evidence
     half_widths: Intervals
     noise: Array
     parts: DataSplit
     base: ActuatorParameters
+    clocks: Sequence[RecordingClock]
 
     @property
     def samples(self) -> Samples:
         """Rows of all logs."""
-        return self.after.model.samples
+        return self.after.samples
 
     @cached_property
     def ideal_torque(self) -> Array:
         """Torque of the commanded PD law without delays, (N, J), N m."""
-        commanded = np.ones_like(self.after.model.gains)
+        commanded = np.ones_like(self.after.gains)
         commanded[1] = 0.0 if self.samples.undamped else 1.0
         return pd_torque(self.samples, commanded, 0.0, 0.0, 0.0)
 
     @property
     def predicted(self) -> Array:
         """Torque that the corrected model predicts, (N, J), N m."""
-        return self.after.model.predictive().predict()
+        return self.after.predictive().predict()
 
     @property
     def regressors(self) -> list[tuple[int, AppliedEffect, RegressorCandidate]]:
         """Regressors of named signals: index among the effects, effect, and its form."""
         return [
             (k, effect, effect.candidate)
-            for k, effect in enumerate(self.after.model.effects)
+            for k, effect in enumerate(self.after.effects)
             if isinstance(effect.candidate, RegressorCandidate)
         ]
 
@@ -161,7 +159,11 @@ def build_identification(outcome: Outcome, findings: Sequence[tuple[str, LogFind
     report = _report(outcome)
     report["findings"] = [{"log": name, **attrs.asdict(one)} for name, one in findings]
     corrected = actuator_parameters(
-        outcome.after.all_rows, outcome.parts, outcome.base, outcome.half_widths.effects
+        outcome.after,
+        outcome.parts,
+        outcome.base,
+        outcome.half_widths.effects,
+        [one.offset_s for one in outcome.clocks if one.offset_s is not None],
     )
     return Identification(report, corrected, _traces(outcome), _shapes(outcome))
 
@@ -173,7 +175,7 @@ def _report(o: Outcome) -> dict[str, Any]:
         name: samples.tau - torque
         for name, torque in (
             ("pd", o.ideal_torque),
-            ("before", o.before.model.predict()),
+            ("before", o.before.predict()),
             ("after", o.predicted),
         )
     }
@@ -201,14 +203,13 @@ def _report(o: Outcome) -> dict[str, Any]:
         "pd": mses["pd"],
         "before": mses["before"]
         | {
-            **{
-                name: float(each[0])
-                for name, each in zip(_DELTAS, gain_deviations(o.before.all_rows), strict=True)
-            },
-            "input_delay_ms": 1e3 * float(o.before.all_rows.delays[0, 0]),
-            "output_delay_ms": 1e3 * float(o.before.all_rows.delays[1, 0]),
+            **{name: float(each[0]) for name, each in zip(_DELTAS, gain_deviations(o.before), strict=True)},
+            "input_delay_ms": 1e3 * float(o.before.delays[0, 0]),
+            "output_delay_ms": 1e3 * float(o.before.delays[1, 0]),
         },
         "after": mses["after"] | _gain_entries(o),
+        "clocks": [_clock_entry(one) for one in o.clocks],
+        "judged_rows": int(parts.report.any(axis=1).sum()),
         "effects": sorted(_effect_entries(o), key=lambda one: -one["heldout_gain"]),
         "rejected": [
             {"name": name, "selecting_gain": gain, "reason": why} for name, gain, why in o.evidence.rejected
@@ -218,18 +219,30 @@ def _report(o: Outcome) -> dict[str, Any]:
             f"{name} is at its bound: its value and interval are not valid" for name in o.half_widths.at_bound
         ]
         + _unconfirmed_warnings(o)
-        + _delay_spread_warnings(o.after.all_rows)
-        + _negative_gain_warnings(o.after.all_rows)
+        + _delay_spread_warnings(o.after)
         + _torque_limit_warnings(o),
     }
     report["decision"] = summary_text(report)
     return report
 
 
+def _clock_entry(clock: RecordingClock) -> dict[str, Any]:
+    """Entry of the report for the clock of a recording."""
+    known = clock.offset_s is not None
+    ends = (clock.offset_s or 0.0) + clock.half_width_s * np.array([-1.0, 1.0])
+    return {
+        "log": clock.log,
+        "heldout": clock.heldout,
+        "even": clock.even,
+        "command_offset_ms": 1e3 * clock.offset_s if clock.offset_s is not None else None,
+        "command_offset_ms_ci95": (1e3 * ends).tolist() if known else None,
+    }
+
+
 def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[str, Any]:
     """Section on the residual: regressors of signals, or structure that no effect explains."""
     parts, samples = o.parts, o.samples
-    residual = samples.tau - o.after.model.predict()
+    residual = samples.tau - o.after.predict()
     p = np.minimum(
         whiteness_p_values(residual, parts.all_rows, samples.start, parts.noise_overlap),
         normality_p_values(residual, parts.all_rows),
@@ -242,7 +255,8 @@ def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[
         else np.zeros(len(coloured), bool)
     )
     removable = before - floor
-    structured = bool(names) or not o.evidence.is_white
+    is_large = after > (1.0 + MIN_EFFECT_SIZE) * floor
+    structured = bool(names) or (not o.evidence.is_white and (bool(o.evidence.correlates) or is_large))
     return {
         "verdict": "structured" if structured else "white",
         "fraction": float(np.clip((after - floor) / removable, 0.0, 1.0))
@@ -250,6 +264,18 @@ def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[
         else 0.0,
         "depends_on": list(dict.fromkeys(names or o.evidence.correlates)),
         "joints": np.array(samples.joints)[joints | (coloured & structured)].tolist(),
+        "edges": _edge_shares(o.after, samples.tau - o.predicted, parts.report),
+    }
+
+
+def _edge_shares(model: Model, residual: Array, rows: Bools) -> dict[str, float]:
+    """Shares of the reported error and rows within `_EDGE_S` after the command of the joint changed."""
+    earlier = model.with_delays(model.delays + np.array([[_EDGE_S], [0.0]])).signals.q_des
+    edge = rows & (np.abs(model.signals.q_des - earlier) > _MIN_STEP_RAD)
+    error = np.where(rows, residual, 0.0) ** 2
+    return {
+        "rows": float(edge.sum() / max(rows.sum(), 1)),
+        "error": float(np.sum(error, where=edge) / max(error.sum(), 1e-300)),
     }
 
 
@@ -257,7 +283,7 @@ def _unconfirmed_warnings(o: Outcome) -> list[str]:
     """Warnings about effects that are not significant on the reported rows."""
     return [
         f"{effect.candidate.name} is not confirmed by the reported rows (p = {evidence.p_value:.2g} there)"
-        for effect, evidence in zip(o.after.model.effects, o.evidence.effects, strict=True)
+        for effect, evidence in zip(o.after.effects, o.evidence.effects, strict=True)
         if evidence.p_value > SIGNIFICANCE_LEVEL
     ]
 
@@ -271,17 +297,6 @@ def _delay_spread_warnings(model: Model) -> list[str]:
         f"delays differ by up to {spread:.1f} ms between joints: actuator.yaml contains their median, so that a model that "
         "runs with it has a larger error than reported"
     ]
-
-
-def _negative_gain_warnings(model: Model) -> list[str]:
-    """Warnings about negative gains, which no drive has: the log or the model is wrong."""
-    found = []
-    for name, row in zip(("kp", "kd"), model.gains, strict=True):
-        joints = np.array(model.samples.joints)[row < 0.0]
-        if len(joints):
-            text = f"{name} + delta_{name} is negative on {', '.join(joints)}"
-            found.append(f"{text}: check the signs and stamps of the log before you use this report")
-    return found
 
 
 def _torque_limit_warnings(o: Outcome) -> list[str]:
@@ -298,7 +313,7 @@ def _torque_limit_warnings(o: Outcome) -> list[str]:
 
 def _gain_entries(o: Outcome) -> dict[str, Any]:
     """Gain deviations and delays with intervals: a number if joints share it, else a list."""
-    model, widths = o.after.all_rows, o.half_widths
+    model, widths = o.after, o.half_widths
     found: dict[str, Any] = {}
     halves = widths.gains * np.array(model.samples.reference_gains)[:, None]
     rows = {
@@ -317,9 +332,9 @@ def _effect_entries(o: Outcome) -> list[dict[str, Any]]:
     """Entries of the report for all effects; the regressors of named signals share one."""
     joints = o.samples.joints
     found = [
-        _effect_entry(evidence, effect, half, joints)
+        _effect_entry(evidence, effect, half, joints, o.half_widths.at_bound)
         for evidence, effect, half in zip(
-            o.evidence.effects, o.after.all_rows.effects, o.half_widths.effects, strict=True
+            o.evidence.effects, o.after.effects, o.half_widths.effects, strict=True
         )
         if not isinstance(effect.candidate, RegressorCandidate)
     ]
@@ -339,6 +354,7 @@ def _regressors_entry(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
         "indistinguishable": [],
         "heldout_gain": sum(o.evidence.effects[k].gain for k, _, _ in ranked),
         "p_value": min(o.evidence.effects[k].p_value for k, _, _ in ranked),
+        "at_bound": False,
         "inputs": list(dict.fromkeys(name for _, _, one in ranked for name in one.input_signals)),
         "terms": [
             {
@@ -354,7 +370,11 @@ def _regressors_entry(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
 
 
 def _effect_entry(
-    evidence: SelectedEffect, effect: AppliedEffect, half: Array, joints: Sequence[str]
+    evidence: SelectedEffect,
+    effect: AppliedEffect,
+    half: Array,
+    joints: Sequence[str],
+    at_bound: Sequence[str],
 ) -> dict[str, Any]:
     """Entry of the report for one effect."""
     settings = effect_settings(effect)
@@ -365,6 +385,7 @@ def _effect_entry(
         "indistinguishable": list(evidence.indistinguishable),
         "heldout_gain": evidence.gain,
         "p_value": evidence.p_value,
+        "at_bound": any(name.partition(".")[0] == effect.candidate.name for name in at_bound),
         **effect.candidate.record_statistics(),
     }
     if settings:
@@ -380,7 +401,7 @@ def _traces(o: Outcome) -> dict[str, Trace]:
     series = {
         "measured": samples.tau,
         "pd": o.ideal_torque,
-        "before": o.before.model.predict(),
+        "before": o.before.predict(),
         "after": o.predicted,
     }
     rows = np.flatnonzero(reported.any(axis=1))[:_MAX_POINTS]
@@ -396,11 +417,11 @@ def _traces(o: Outcome) -> dict[str, Trace]:
 def _shapes(o: Outcome) -> tuple[Shape, ...]:
     """Residual over the signal that explains it, for up to three joints of each effect."""
     samples = o.samples
-    before, after = samples.tau - o.before.model.predict(), samples.tau - o.predicted
+    before, after = samples.tau - o.before.predict(), samples.tau - o.predicted
     rows = np.flatnonzero(o.parts.report.any(axis=1))
     rows = rows[:: max(1, len(rows) // _MAX_POINTS)]
     found = []
-    for effect in o.after.model.effects:
+    for effect in o.after.effects:
         for j in np.flatnonzero(effect.active)[:3]:
             x, unit = _signal_series(o, effect.candidate.signal, int(j))
             found.append(
@@ -419,7 +440,7 @@ def _shapes(o: Outcome) -> tuple[Shape, ...]:
 
 def _signal_series(o: Outcome, name: str, joint: int) -> tuple[Array, str]:
     """A signal of one joint by its name in the report, and its unit."""
-    s, samples = o.after.model.signals, o.samples
+    s, samples = o.after.signals, o.samples
     owner, _, plain = name.rpartition("/")
     j = samples.joints.index(owner) if owner else joint
     kind = plain.partition("@")[0]

@@ -1,10 +1,22 @@
-"""Sanity checks of a report: results that must not be used without inspection."""
+"""Sanity checks of a result: models that must not be used, and why.
+
+A plausible drive has gains near the commanded ones and delays within their range, and its torque is
+mostly explained by the PD law. Logs with a gross fault (dead speeds, a command column that holds the
+next state) fit well but are not plausible.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import attrs
+import numpy as np
+
+from quadvel_description.arrays import Array, Bools
+
+from ..model.torque_model import MAX_DELAYS_S, Model
+from ..search.regressors import RegressorCandidate
 from ..statistics.baselines import FILTER_SPAN_S
 
 MAX_REPLAY_ERROR_RAD = 1.0
@@ -13,6 +25,77 @@ MIN_EXPLAINED_FRACTION = 0.5
 """Minimum fraction of the torque's variance that a valid model explains."""
 BASELINE_ERROR_RATIO = 1.05
 """Error ratio to a baseline above which the model is worse than the baseline."""
+GAIN_RATIOS = 0.2, 4.0
+"""Plausible ratios of real to commanded gain, without the ends; a fit ends at the upper one."""
+MAX_LEARNED_FRACTION = 1.0 / 3.0
+"""Maximum share of the predicted torque's variance that regressors of named signals may have."""
+
+_GAIN_CAUSES = {
+    "kp": "q or q_des of another joint, unit or sign; a command column that holds the next state; "
+    "commanded gains of another unit",
+    "kd": "dq that is dead for a while, or of another unit, sign or joint; commanded gains of another unit",
+}
+_DELAY_CAUSE = "states and commands of different clocks; a command column that holds the state"
+_LEARNED_CAUSE = "a controller that is no PD law; a signal of another joint, unit or sign; a dead signal"
+
+
+def implausibilities(model: Model, rows: Bools) -> Iterator[str]:
+    """Check whether a fitted model is that of a PD-controlled joint.
+
+    Args:
+        model: The fitted model of J joints.
+        rows: Samples on which the torque of learned regressors is compared, (N, J) bool.
+
+    Yields:
+        One sentence for each implausible property, with its likely causes.
+    """
+    samples = model.samples
+    for name, gains, reference, commanded in zip(
+        ("kp", "kd"),
+        model.gains,
+        samples.reference_gains,
+        (samples.commanded, samples.commanded and not samples.undamped),
+        strict=True,
+    ):
+        low, high = GAIN_RATIOS if commanded else (0.0, np.inf)
+        wrong = (gains <= low) | (gains >= high)
+        if name == "kd" and not commanded:
+            wrong = gains < 0.0  # a drive without damping is possible
+        if wrong.any():
+            each = ", ".join(f"{g * reference:.3g}" for g in np.unique(gains[wrong].round(6)))
+            asked = f"{reference:.3g} was commanded" if commanded else "a positive gain is expected"
+            yield f"{name} is {each} on {_names(model, wrong)}, but {asked} (likely: {_GAIN_CAUSES[name]})"
+    for name, values, most in zip(("input", "output"), model.delays, MAX_DELAYS_S, strict=True):
+        if (values >= most - 1e-9).any():
+            text = f"the {name} delay reaches its bound of {1e3 * most:.0f} ms"
+            yield f"{text} (likely: {_DELAY_CAUSE})"
+    share = _learned_fraction(model, rows)
+    if share > MAX_LEARNED_FRACTION:
+        yield (
+            f"learned terms explain {100.0 * share:.0f} % of the torque, more than a third "
+            f"(likely: {_LEARNED_CAUSE})"
+        )
+
+
+def _learned_fraction(model: Model, rows: Bools) -> float:
+    """Share of the predicted torque's variance that disappears without the learned regressors."""
+    kept = tuple(one for one in model.effects if not isinstance(one.candidate, RegressorCandidate))
+    if len(kept) == len(model.effects):
+        return 0.0
+    torque = model.predict()
+    learned = torque - attrs.evolve(model, effects=kept).predict()
+    return _variance(learned, rows) / max(_variance(torque, rows), 1e-300)
+
+
+def _variance(torque: Array, rows: Bools) -> float:
+    """Variance about each joint's mean, summed over joints, N^2 m^2."""
+    return float(sum(np.var(one[keep]) for one, keep in zip(torque.T, rows.T, strict=True) if keep.any()))
+
+
+def _names(model: Model, joints: Bools) -> str:
+    """Names of some joints, or `all joints`."""
+    names = [one for one, chosen in zip(model.samples.joints, joints, strict=True) if chosen]
+    return "all joints" if len(names) == len(joints) else ", ".join(names)
 
 
 def contradictions(report: Mapping[str, Any]) -> Iterator[str]:
@@ -22,7 +105,7 @@ def contradictions(report: Mapping[str, Any]) -> Iterator[str]:
         report: Content of report.json.
 
     Yields:
-        One warning for each contradiction.
+        One sentence for each contradiction.
     """
     after = report["after"]
     for name, what in (

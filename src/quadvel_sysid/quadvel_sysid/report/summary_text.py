@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from quadvel_actuator.effects.basis_regressors import LEARNED_RESIDUAL
@@ -14,6 +14,11 @@ UNCORRELATED_TEXT = "uncorrelated with every logged signal; the cause may be too
 _JOINT_GAINS_ERROR_RATIO = 0.9
 """Error ratio below which separate gains and delays of each joint are mentioned."""
 
+NOT_PD_TEXT = "Not a PD-controlled joint as logged"
+WITHDRAWN_TEXT = "No decision"
+"""Begin of a decision that was withdrawn, for an implausible result and for one that is contradicted."""
+_MIN_EDGE_ERROR_SHARE, _MAX_EDGE_ROW_SHARE = 0.5, 0.2
+"""Share of the error, and of the rows, after changes of commands, from which the summary mentions it."""
 _HELDOUT_ERROR_RATIO = 1.5
 """Ratio of held-out to fitted error above which the held-out data show a further effect."""
 
@@ -52,17 +57,28 @@ def _effects_text(report: Mapping[str, Any]) -> str:
     """Summary of a report with effects."""
     before, after = report["before"]["heldout_mse"], report["after"]["heldout_mse"]
     effects, rest = report["effects"], report["unexplained"]
-    shown = [one for one in effects if one["p_value"] <= SIGNIFICANCE_LEVEL]
-    named = ", ".join(dict.fromkeys(one["name"] for one in shown or effects))
-    cut = 100.0 * (1.0 - after / before) if before > 0.0 else 0.0
-    way = f"{'falls' if cut >= 0.0 else 'rises'} by {abs(cut):.0f} %"
-    text = f"Add {named}: the held-out error {way}, from {before:.3g} to {after:.3g} N^2 m^2"
+    shown = [one for one in effects if one["p_value"] <= SIGNIFICANCE_LEVEL and not one["at_bound"]]
+    change = f"from {before:.3g} to {after:.3g} N^2 m^2"
+    if not shown or after >= before:
+        tried = ", ".join(dict.fromkeys(one["name"] for one in effects))
+        way = "falls" if after < before else "does not fall"
+        text = f"No effect is confirmed: with {tried} the held-out error {way}, {change}"
+    else:
+        named = ", ".join(dict.fromkeys(one["name"] for one in shown))
+        text = f"Add {named}: the held-out error falls by {100.0 * (1.0 - after / before):.0f} %, {change}"
     learned = any(one["name"] == LEARNED_RESIDUAL for one in effects)
     beyond = "the learned remainder" if learned else "the residual"
     more = f"; {beyond} depends on {', '.join(rest['depends_on'])}" if rest["depends_on"] else ""
+    edges = rest["edges"]
+    if edges["error"] >= _MIN_EDGE_ERROR_SHARE and edges["rows"] <= _MAX_EDGE_ROW_SHARE:
+        more += (
+            f"; {100.0 * edges['error']:.0f} % of the remaining error is in the {100.0 * edges['rows']:.0f} % of the "
+            "rows where a command has just changed"
+        )
     for one in effects:
         if shown and one not in shown:
-            more += f"; the model contains {one['name']} as well, but the reported rows do not confirm it"
+            why = "a value of it is at a bound" if one["at_bound"] else "the reported rows do not confirm it"
+            more += f"; the model contains {one['name']} as well, but {why}"
         if "samples_hit" in one:
             more += (
                 f"; {one['name']} affects {100.0 * one['samples_hit']:.2g} % of the samples at random, which no model "
@@ -79,6 +95,80 @@ def _heldout_only_text(report: Mapping[str, Any]) -> str:
     return (
         f" The held-out error is {after:.3g} N^2 m^2, the error of the fitted data {fitted:.3g}: the held-out data contain an "
         "effect that the fitted data hardly show. Add logs that show it to the fitted ones."
+    )
+
+
+def withheld_summary(
+    report: Mapping[str, Any], implausible: Sequence[str], contradicted: Sequence[str]
+) -> dict[str, Any]:
+    """Build the entries of a report whose decision may have to be withdrawn.
+
+    Args:
+        report: Content of report.json.
+        implausible: Reasons why the result is not that of a PD-controlled joint.
+        contradicted: Reasons why the named effects do not describe the joints.
+
+    Returns:
+        The entries `withheld` (the reasons, none if the model can be used), `decision` and `warnings`.
+    """
+    reasons = [*implausible, *contradicted]
+    decision = report["decision"]
+    if reasons:
+        title = NOT_PD_TEXT if implausible else WITHDRAWN_TEXT
+        decision = f"{title}: {'; '.join(reasons)}."
+    return {"withheld": reasons, "decision": decision, "warnings": [*report["warnings"], *reasons]}
+
+
+def leave_one_out(reports: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Build the entry of a report on fits that each leave one log out.
+
+    Args:
+        reports: Content of report.json of each fit, which reports on the log that was left out.
+
+    Returns:
+        `before` and `after` (mean held-out errors, N^2 m^2), `shared` (effects that all fits found),
+        `differing` (effects that some found), and `logs`: for each log its errors, its clock, and
+        the model of the other logs.
+    """
+    named = [dict.fromkeys(one["name"] for one in report["effects"]) for report in reports]
+    every = dict.fromkeys(name for names in named for name in names)
+    shared = [name for name in every if all(name in each for each in named)]
+    values = ("delta_kp", "delta_kd", "input_delay_ms", "output_delay_ms")
+    return {
+        **{
+            name: sum(report[name]["heldout_mse"] for report in reports) / len(reports)
+            for name in ("before", "after")
+        },
+        "shared": shared,
+        "differing": [name for name in every if name not in shared],
+        "logs": [
+            {
+                "log": report["clocks"][-1]["log"],
+                "before": report["before"]["heldout_mse"],
+                "after": report["after"]["heldout_mse"],
+                "ridge": report["baselines"]["ridge"]["heldout_mse"],
+                "command_offset_ms": report["clocks"][-1]["command_offset_ms"],
+                "effects": list(names),
+                **{name: report["after"][name] for name in values},
+            }
+            for report, names in zip(reports, named, strict=True)
+        ],
+    }
+
+
+def leave_one_out_text(entry: Mapping[str, Any]) -> str:
+    """Summarise fits that each leave one log out, in one line.
+
+    Args:
+        entry: `leave_one_out` of report.json.
+
+    Returns:
+        One sentence.
+    """
+    shared, differing = (", ".join(entry[name]) or "none" for name in ("shared", "differing"))
+    return (
+        f"each log left out in turn: error {entry['before']:.3g} before, {entry['after']:.3g} after, N^2 m^2; "
+        f"effects of all fits: {shared}; of some: {differing}"
     )
 
 

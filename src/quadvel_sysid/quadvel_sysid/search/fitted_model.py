@@ -49,9 +49,9 @@ class FittedModel:
 
     @cached_property
     def selection_mse(self) -> Array:
-        """Mean squared error of each joint on the selection rows, (J,), N^2 m^2."""
+        """Mean squared error of each joint on the selection rows, (J,), N^2 m^2, as in `squared_error`."""
         rows = self.evaluator.parts.select
-        square = np.sum(np.where(rows, self.residual, 0.0) ** 2, axis=0)
+        square = np.sum(self.residual**2 + self.model.averaged_noise(), axis=0, where=rows)
         mse: Array = square / np.maximum(rows.sum(axis=0), 1)
         return mse
 
@@ -191,6 +191,8 @@ class ModelEvaluator:
         )
         if not needed.any() or (needed == effect.active).all():
             return fitted
+        if effect.candidate.shared_by_joints and needed.sum() == 1:
+            return fitted  # one joint cannot show a cause that all of them share
         fewer = self.fit(fitted.model.with_replaced_effect(index, attrs.evolve(effect, active=needed)))
         return min(fitted, fewer, key=lambda one: one.criterion)
 

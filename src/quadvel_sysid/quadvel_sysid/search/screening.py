@@ -259,6 +259,8 @@ class DelayGridPoint:
         predicted, slopes = jacobian(self.model, unknowns)
         residual = (self.model.samples.tau - predicted)[self._rows] * rows.weight  # (n, J)
         slopes = slopes[:, :, self._rows] * rows.weight.T[:, None]  # (J, A, n)
+        averaged = self.model.averaged_noise()[self._rows] * rows.weight**2
+        self._averaged = np.sum(averaged, axis=0)  # (J,), as in `squared_error`
 
         # Parameters of effects belong to one joint each: with an orthonormal basis B of their
         # columns every other column c becomes (I - B B') c. Gains and delays are shared by joints
@@ -291,7 +293,7 @@ class DelayGridPoint:
         """Weighted squared error (J,) of the model alone, with the best gains and delays."""
         joints = len(self.residual)
         error, _, _ = self._solve(np.zeros((1, joints, 0, self.residual.shape[1])), None)
-        return error
+        return error + self._averaged
 
     @cached_property
     def torque(self) -> Array:
@@ -357,7 +359,7 @@ class DelayGridPoint:
         regressors = self.regressors(candidate, table)
         projected = np.stack([self.project_out(one) for one in regressors])
         error, choice, (change, weights) = self._solve(projected, candidate)
-        return self._model_at_start(candidate, table, choice, change, weights), error
+        return self._model_at_start(candidate, table, choice, change, weights), error + self._averaged
 
     def _solve(
         self, columns: Array, candidate: EffectCandidate | None

@@ -138,17 +138,22 @@ class Search:
         return SearchResult(self.prune(min(equivalent, key=key)), effects, record)
 
     def residual_correlates(self, fitted: FittedModel) -> tuple[str, ...]:
-        """Return the signals that the residual correlates with most.
+        """Return the signals that the residual depends on, by the score test of a regressor of them.
 
         Args:
             fitted: A fitted model.
 
         Returns:
-            Names of signals, even if a regressor of them would not pay for its parameters.
+            Names of signals; none if no regressor is significant and of the minimum effect size.
         """
-        found = self._candidates_of(fitted).fitted_candidates(REGRESSORS).models
-        best = min(found, key=lambda one: one.criterion, default=None)
-        return () if best is None else best.last_effect.candidate.key
+        found = self._candidates_of(fitted).fitted_candidates(REGRESSORS)
+        best = min(found.models, key=lambda one: one.criterion, default=None)
+        if best is None:
+            return ()
+        comparison = best.compare_with(fitted)
+        is_significant = comparison.p_value * found.tested_count < SIGNIFICANCE_LEVEL
+        is_large = float(np.max(comparison.relative_gain)) > MIN_EFFECT_SIZE
+        return best.last_effect.candidate.key if is_significant and is_large else ()
 
     def prune(self, fitted: FittedModel) -> FittedModel:
         """Simplify a model: fewer effects and joints, special cases, shared values and gains.

@@ -8,6 +8,8 @@ interval contains its parameter values too.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import attrs
 import numpy as np
 from scipy import stats
@@ -47,18 +49,21 @@ class Intervals:
     at_bound: tuple[str, ...]
 
 
-def intervals(model: Model, parts: DataSplit) -> Intervals:
-    """Compute confidence intervals of a model that was fitted to all rows.
+def intervals(model: Model, parts: DataSplit, clock_offsets: Sequence[float] = ()) -> Intervals:
+    """Compute confidence intervals of a model that was fitted to the rows that fit or select.
 
     Args:
         model: The fitted model.
         parts: Data split with the clusters.
+        clock_offsets: Offsets of the recordings' commands, s, whose spread widens the interval of the
+            input delay.
 
     Returns:
         Half widths: random error, plus the error of the effect's form, plus the systematic error.
     """
     # Half width = random error + error of the effect's form + systematic error.
-    random_error = _random_half_widths(model, parts, parts.all_rows)
+    rows = parts.fit_or_select
+    random_error = _random_half_widths(model, parts, rows)
     effects, first = [], 2
     for index, effect in enumerate(model.effects):
         own = random_error[first : first + len(effect.values)]
@@ -71,13 +76,14 @@ def intervals(model: Model, parts: DataSplit) -> Intervals:
             [[_CLOCK_ERROR_S if parameter.unit == "s" else 0.0] for parameter in candidate.parameters]
         )
         systematic = np.maximum(clock, _SYSTEMATIC_FRACTION * np.abs(effect.values)) * effect.active
-        effects.append(sampling + _form_error(model, index, parts.all_rows) + systematic)
+        effects.append(sampling + _form_error(model, index, rows) + systematic)
     # A half width as large as the gain (or 1) means that any gain from 0 on is possible.
     size = np.abs(model.gains)
     gains = np.minimum(random_error[:2] + _SYSTEMATIC_GAIN_FRACTION * size, np.maximum(1.0, size))
     # Input delays may be anywhere in the flat valley of the error.
     delays = random_error[-2:] + _CLOCK_ERROR_S
-    delays[0] = np.maximum(delays[0], delay_flatness(model, parts.all_rows) + _CLOCK_ERROR_S)
+    delays[0] = np.maximum(delays[0], delay_flatness(model, rows) + _CLOCK_ERROR_S)
+    delays[0] += max(map(abs, clock_offsets), default=0.0)
     delays = np.minimum(delays, MAX_DELAYS_S[:, None])
     return Intervals(gains, tuple(effects), delays, parameters_at_bound(model))
 
