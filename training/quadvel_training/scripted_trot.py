@@ -15,7 +15,7 @@ from .env import VelocityEnv
 from .gait_clock import GaitClock, duty_factor, step_frequency
 
 CROUCH_M = 0.05  # by which the trunk is lower than in the nominal posture: longer steps are in reach
-FEET = foot_positions(robot.NOMINAL_Q) + [0.0, 0.0, CROUCH_M]  # (4, 3), m, trunk frame
+FEET = foot_positions(robot.NOMINAL_Q) + np.array([0.0, 0.0, CROUCH_M])  # (4, 3), m, trunk frame
 LIFT_M = 0.08  # height of a swing
 LONGEST_STEP_M = 0.36  # way of a foot under the trunk in one stance
 LEAD_S = 0.05  # joints follow their targets so late
