@@ -36,7 +36,15 @@ LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 """Encapsulation of plain CDR, little endian: all messages of a little-endian machine."""
 _STATE_HEAD, _COMMAND_HEAD = struct.Struct("<4siII"), struct.Struct("<4siIIB3x")
 _ESTIMATE_HEAD = struct.Struct("<4siII")
-_ESTIMATE_SIZES = {"linear": 3}
+
+
+def _places(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """Return the place of each field in the numbers of a message."""
+    ends = pairwise(accumulate(sizes.values(), initial=0))
+    return {name: slice(*place) for name, place in zip(sizes, ends, strict=True)}
+
+
+_STATE, _COMMAND, _ESTIMATE = map(_places, (LOW_STATE_SIZES, LOW_CMD_SIZES, {"linear": 3}))
 Stamp = tuple[int, int]
 """Time as s and ns."""
 
@@ -56,7 +64,7 @@ def decode_low_state(data: bytes) -> tuple[Stamp, RobotState]:
         NotUnitError: The norm of the quaternion is not 1 within QUATERNION_TOLERANCE.
     """
     seconds, nanoseconds, tick = _unpack(_STATE_HEAD, data)
-    fields = _numbers(data, _STATE_HEAD.size, np.float32, LOW_STATE_SIZES)
+    fields = _numbers(data, _STATE_HEAD.size, np.float32, _STATE)
     return (seconds, nanoseconds), robot_state(float(seconds + 1e-9 * nanoseconds), tick, fields)
 
 
@@ -90,7 +98,7 @@ def decode_low_cmd(data: bytes) -> JointCommand:
         NotFiniteError: A number is NaN or infinite.
     """
     _, _, tick, mode = _unpack(_COMMAND_HEAD, data)
-    q, dq, tau, kp, kd = _numbers(data, _COMMAND_HEAD.size, np.float32, LOW_CMD_SIZES)
+    q, dq, tau, kp, kd = _numbers(data, _COMMAND_HEAD.size, np.float32, _COMMAND)
     return JointCommand(q, dq, tau, kp, kd, mode, tick)
 
 
@@ -146,7 +154,7 @@ def decode_estimate(data: bytes) -> tuple[float, Array]:
         NotFiniteError: A number of the velocity is NaN or infinite.
     """
     seconds, nanoseconds, length = _unpack(_ESTIMATE_HEAD, data)
-    (velocity,) = _numbers(data, _estimate_offset(length), np.float64, _ESTIMATE_SIZES)
+    (velocity,) = _numbers(data, _estimate_offset(length), np.float64, _ESTIMATE)
     return float(seconds + 1e-9 * nanoseconds), velocity
 
 
@@ -162,15 +170,13 @@ def _unpack(head: struct.Struct, data: bytes) -> tuple[int, ...]:
     return head.unpack_from(data)[1:]
 
 
-def _numbers(data: bytes, offset: int, kind: type[np.floating], sizes: Mapping[str, int]) -> list[Array]:
+def _numbers(data: bytes, offset: int, kind: type[np.floating], places: dict[str, slice]) -> list[Array]:
     """Return the fields from a byte on, finite, as float64."""
-    count = sum(sizes.values())
+    count = next(reversed(places.values())).stop
     if len(data) < offset + count * np.dtype(kind).itemsize:
         raise MessageError(f"message has {len(data)} bytes, expected {count} numbers from byte {offset} on")
     block = np.frombuffer(data, kind, count, offset).astype(np.float64)
-    ends = list(accumulate(sizes.values(), initial=0))
-    fields = [block[start:end] for start, end in pairwise(ends)]
     if np.count_nonzero(np.isfinite(block)) < count:  # faster than np.all for short arrays
-        for name, value in zip(sizes, fields, strict=True):
-            require_finite(name, value)
-    return fields
+        for name, place in places.items():
+            require_finite(name, block[place])
+    return [block[place] for place in places.values()]
