@@ -14,8 +14,9 @@ A number is aligned to its own size, counted from the end of the 4 bytes of enca
 
 from __future__ import annotations
 
-import math
 import struct
+from collections.abc import Mapping
+from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,8 +28,7 @@ from .messages import (
     LOW_CMD_SIZES,
     LOW_STATE_SIZES,
     MessageError,
-    NotFiniteError,
-    NumericFields,
+    require_finite,
     robot_state,
 )
 
@@ -36,7 +36,15 @@ LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 """Encapsulation of plain CDR, little endian: all messages of a little-endian machine."""
 _STATE_HEAD, _COMMAND_HEAD = struct.Struct("<4siII"), struct.Struct("<4siIIB3x")
 _ESTIMATE_HEAD = struct.Struct("<4siII")
-_STATE_FIELDS, _COMMAND_FIELDS = NumericFields(LOW_STATE_SIZES), NumericFields(LOW_CMD_SIZES)
+
+
+def _places(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """Return the place of each field in the numbers of a message."""
+    ends = pairwise(accumulate(sizes.values(), initial=0))
+    return {name: slice(*place) for name, place in zip(sizes, ends, strict=True)}
+
+
+_STATE, _COMMAND, _ESTIMATE = map(_places, (LOW_STATE_SIZES, LOW_CMD_SIZES, {"linear": 3}))
 Stamp = tuple[int, int]
 """Time as s and ns."""
 
@@ -56,7 +64,7 @@ def decode_low_state(data: bytes) -> tuple[Stamp, RobotState]:
         NotUnitError: The norm of the quaternion is not 1 within QUATERNION_TOLERANCE.
     """
     seconds, nanoseconds, tick = _unpack(_STATE_HEAD, data)
-    fields = _STATE_FIELDS.split(_floats(data, _STATE_HEAD.size, np.float32, 50))
+    fields = _numbers(data, _STATE_HEAD.size, np.float32, _STATE)
     return (seconds, nanoseconds), robot_state(float(seconds + 1e-9 * nanoseconds), tick, fields)
 
 
@@ -90,7 +98,7 @@ def decode_low_cmd(data: bytes) -> JointCommand:
         NotFiniteError: A number is NaN or infinite.
     """
     _, _, tick, mode = _unpack(_COMMAND_HEAD, data)
-    q, dq, tau, kp, kd = _COMMAND_FIELDS.split(_floats(data, _COMMAND_HEAD.size, np.float32, 60))
+    q, dq, tau, kp, kd = _numbers(data, _COMMAND_HEAD.size, np.float32, _COMMAND)
     return JointCommand(q, dq, tau, kp, kd, mode, tick)
 
 
@@ -146,9 +154,7 @@ def decode_estimate(data: bytes) -> tuple[float, Array]:
         NotFiniteError: A number of the velocity is NaN or infinite.
     """
     seconds, nanoseconds, length = _unpack(_ESTIMATE_HEAD, data)
-    velocity = _floats(data, _estimate_offset(length), np.float64, 3)
-    if not all(map(math.isfinite, values := velocity.tolist())):
-        raise NotFiniteError(f"linear is {values}, expected finite numbers")
+    (velocity,) = _numbers(data, _estimate_offset(length), np.float64, _ESTIMATE)
     return float(seconds + 1e-9 * nanoseconds), velocity
 
 
@@ -164,8 +170,13 @@ def _unpack(head: struct.Struct, data: bytes) -> tuple[int, ...]:
     return head.unpack_from(data)[1:]
 
 
-def _floats(data: bytes, offset: int, kind: type[np.floating], count: int) -> Array:
-    """Return a copy of `count` numbers as float64."""
+def _numbers(data: bytes, offset: int, kind: type[np.floating], places: dict[str, slice]) -> list[Array]:
+    """Return the fields from a byte on, finite, as float64."""
+    count = next(reversed(places.values())).stop
     if len(data) < offset + count * np.dtype(kind).itemsize:
         raise MessageError(f"message has {len(data)} bytes, expected {count} numbers from byte {offset} on")
-    return np.frombuffer(data, kind, count, offset).astype(np.float64)
+    block = np.frombuffer(data, kind, count, offset).astype(np.float64)
+    if np.count_nonzero(np.isfinite(block)) < count:  # faster than np.all for short arrays
+        for name, place in places.items():
+            require_finite(name, block[place])
+    return [block[place] for place in places.values()]
