@@ -14,13 +14,13 @@ from quadvel_description.kinematics import foot_positions, inverse_kinematics
 from .env import VelocityEnv
 from .gait_clock import GaitClock, duty_factor, step_frequency
 
-CROUCH_M = 0.05  # by which the trunk is lower than in the nominal posture: longer steps are in reach
+CROUCH_M = 0.03  # by which the trunk is lower than in the nominal posture: longer steps are in reach
 FEET = foot_positions(robot.NOMINAL_Q) + np.array([0.0, 0.0, CROUCH_M])  # (4, 3), m, trunk frame
 LIFT_M = 0.08  # height of a swing
 LONGEST_STEP_M = 0.36  # way of a foot under the trunk in one stance
 LEAD_S = 0.05  # joints follow their targets so late
-SWEEP = 1.2  # targets sweep so much faster than the ground, as joints lag behind them
-PLACEMENT_S = 0.15  # feet are placed this time times the excess velocity further out (Raibert)
+PLACEMENT_S = 0.12  # feet are placed this time times the excess velocity further out (Raibert),
+BEHIND_S = 0.05  # and this time times the commanded velocity further behind, which drives the robot
 MAX_EXCESS = 0.5  # m/s, excess velocity that counts
 RATE_S = 0.1  # time that a roll or pitch rate is extrapolated
 
@@ -46,14 +46,15 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
     under = np.stack(
         [vx[:, None] - wz[:, None] * FEET[:, 1], vy[:, None] + wz[:, None] * FEET[:, 0]], axis=-1
     )
-    way = SWEEP * under * (duty / frequency)[:, None, None]  # (n, 4, 2), m
+    way = under * (duty / frequency)[:, None, None]  # (n, 4, 2), m
     way *= np.minimum(1.0, LONGEST_STEP_M / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
     # place on the way, from 1 to -1 in stance and back in swing: 1 - 2 phase / duty, -cos(pi s)
     along = np.where(down, 1.0 - 2.0 * phases / duty[:, None], -np.cos(np.pi * swing))
-    # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_command)
+    # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_command) - BEHIND_S v_command
     excess = np.clip(env.velocity[:, :2] - command[:, :2], -MAX_EXCESS, MAX_EXCESS)
     feet = np.broadcast_to(FEET, (len(command), 4, 3)).copy()
-    feet[..., :2] += 0.5 * way * along[..., None] + PLACEMENT_S * excess[:, None, :]
+    placed = PLACEMENT_S * excess - BEHIND_S * command[:, :2]
+    feet[..., :2] += 0.5 * way * along[..., None] + placed[:, None, :]
     # z_foot = z_nominal + LIFT_M sin^2(pi s); a stance foot on the lower side of the trunk pushes
     # down: z_foot += y roll - x pitch, both extrapolated by RATE_S
     roll, pitch = (env.roll_pitch + RATE_S * env.angular_velocity[:, :2]).T[..., None]
