@@ -206,7 +206,7 @@ class LiveRun:
         while not until() and time.monotonic() < end:
             if self._signals.received:
                 raise typer.Exit(128 + self._signals.received)
-            if self._group.ended():
+            if self._group.ended() or (self._reports and self._reports[-1].fault):
                 raise self._not_walking()
             self._drive.publish(twist)
             time.sleep(POLL_PERIOD_S)
