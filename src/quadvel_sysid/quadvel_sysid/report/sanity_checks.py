@@ -116,7 +116,7 @@ def contradictions(report: Mapping[str, Any]) -> Iterator[str]:
         ("ridge", f"a ridge regression over {1e3 * FILTER_SPAN_S:.0f} ms"),
     ):
         other = report["baselines"][name]["heldout_mse"]
-        if after["heldout_mse"] > BASELINE_ERROR_RATIO * other:
+        if report["effects"] and after["heldout_mse"] > BASELINE_ERROR_RATIO * other:
             yield (
                 f"{what} has a smaller held-out error, {other:.3g} N^2 m^2, than the corrected model, "
                 f"{after['heldout_mse']:.3g}: the named effects do not describe the joints"
