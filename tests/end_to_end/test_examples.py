@@ -90,6 +90,8 @@ NODES = [
 SESSIONS = {"robot": ROBOT, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
 
 LEFT_OUT = {
+    "python -m benchmarks.identification.others walks FOLDER": "needs measured walks",
+    "python -m benchmarks.identification.others faulty FILE --kinds clean": "needs a file of faults",
     "quadvel demo follow --tour --out out/tour": "tests/end_to_end/test_follow_demo.py runs the demo",
     "quadvel following --out out/following": "minutes; tests/quadvel_follow/test_follow_planner.py walks on its stage",
     "quadvel people --scans FOLDER --out out/people": "real scans that are no part of this repository; "

@@ -41,6 +41,7 @@ REPORT = {
     "before": {"heldout_mse": 1.0},
     "after": {"heldout_mse": 0.3, "heldout_q_rms_rad": 0.01},
     "baselines": {"joint_pd": {"heldout_mse": 0.8}, "ridge": {"heldout_mse": 0.5}},
+    "effects": [{"name": "armature"}],
     "noise_floor": 0.25,
 }
 
@@ -80,3 +81,8 @@ def test_error_line_lists_baselines_and_models() -> None:
 def test_a_model_that_is_worse_than_a_baseline_gets_a_warning(after: dict[str, float], sentence: str) -> None:
     assert list(contradictions(REPORT)) == []
     assert any(text.startswith(sentence) for text in contradictions(REPORT | {"after": after}))
+
+
+def test_a_baseline_contradicts_named_effects_alone() -> None:
+    worse = REPORT | {"after": {"heldout_mse": 0.9}, "effects": []}
+    assert list(contradictions(worse)) == []

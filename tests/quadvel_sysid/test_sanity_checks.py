@@ -8,6 +8,7 @@ import pytest
 from simulated_joints import parameters, record
 
 from quadvel_sysid.data.signals import Samples
+from quadvel_sysid.data.split import DataSplit
 from quadvel_sysid.model.torque_model import Model
 from quadvel_sysid.report.sanity_checks import implausibilities
 
@@ -21,8 +22,10 @@ def model() -> Model:
     return Model(samples, 0.0, np.ones((2, 2)), one, delays, one)
 
 
-def reasons(model: Model) -> str:
-    return "; ".join(implausibilities(model, model.samples.evaluated))
+def reasons(model: Model, noise_overlap: int = 0) -> str:
+    rows = model.samples.evaluated
+    parts = DataSplit(rows, rows, rows, np.zeros(1, dtype=np.intp), noise_overlap)
+    return "; ".join(implausibilities(model, parts))
 
 
 def test_gains_near_the_commanded_ones_are_plausible(model: Model) -> None:
@@ -44,3 +47,6 @@ def test_gains_far_from_the_commanded_ones_are_not(model: Model, row: int, name:
 def test_a_delay_at_its_bound_is_not_plausible(model: Model) -> None:
     late = model.with_delays(np.repeat([[0.02], [0.001]], 2, axis=1))
     assert reasons(late).startswith("the input delay reaches its bound of 20 ms")
+    later = model.with_delays(np.repeat([[0.007], [0.006]], 2, axis=1))
+    assert reasons(later).startswith("the output delay reaches its bound of 6 ms")
+    assert reasons(later, noise_overlap=1) == ""  # the torque follows from the motion

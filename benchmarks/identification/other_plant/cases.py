@@ -273,7 +273,8 @@ def _log(
         "kd": np.array(kd),
         "stamps": style,
     }
-    # A wrong stamp reads the command of another time: kp^2 times the mean square of that change.
+    # A wrong stamp reads the command of another time: kp^2 times the mean square of that change. An
+    # identification that restores the stamps can be below this floor.
     newest = (np.searchsorted(sent, at - machine.input_s, side="right") - 1 for at in (true_t, t))
     a, b = (targets[np.maximum(one, 0)] for one in newest)
     moved = float(np.mean((kp * (a - b)) ** 2))

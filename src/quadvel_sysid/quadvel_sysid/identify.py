@@ -153,9 +153,7 @@ def _identify_once(dataset: Dataset, options: IdentifyOptions, progress: Progres
     report = {**found.report, **_comparisons(outcome, replay)}
     if "motion" in report:
         report |= motion_summary(report)
-    report |= withheld_summary(
-        report, list(implausibilities(after, parts.report)), list(contradictions(report))
-    )
+    report |= withheld_summary(report, list(implausibilities(after, parts)), list(contradictions(report)))
     progress(1.0, "done")
     return attrs.evolve(found, report=report)
 

@@ -34,7 +34,6 @@ from ..search.regressors import RegressorCandidate
 from ..statistics.baselines import explained_share, torque_variance
 from ..statistics.confidence import Intervals
 from ..statistics.criterion import (
-    MIN_EFFECT_SIZE,
     SIGNIFICANCE_LEVEL,
     WHITENESS_LEVEL,
     normality_p_values,
@@ -255,8 +254,7 @@ def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[
         else np.zeros(len(coloured), bool)
     )
     removable = before - floor
-    is_large = after > (1.0 + MIN_EFFECT_SIZE) * floor
-    structured = bool(names) or (not o.evidence.is_white and (bool(o.evidence.correlates) or is_large))
+    structured = bool(names) or not o.evidence.is_white
     return {
         "verdict": "structured" if structured else "white",
         "fraction": float(np.clip((after - floor) / removable, 0.0, 1.0))
