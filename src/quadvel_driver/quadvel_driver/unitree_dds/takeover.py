@@ -74,7 +74,7 @@ class DdsTakeover(Takeover):
         self._codes: dict[int, int] = {}  # of the last answer to each request, 0 for success
         self._asked_at = self._answered_at = -math.inf
         self._asking_since: float | None = None
-        self._held_back_at = -math.inf  # when another controller or writer was seen last
+        self._held_back_at = -math.inf  # when `problem` last spoke against a takeover
         self._obeyed_at = -math.inf
         self._lost_at: float | None = None
 
@@ -92,18 +92,15 @@ class DdsTakeover(Takeover):
 
     def _take(self, now: float, newest: BoardState | None, foreign: str) -> None:
         """Take the joints if nothing speaks against it."""
-        self.problem = self._state_problem(newest)
-        if self.problem:  # the robot's own controller keeps the legs
-            return
-        self._ask_for_mode(now)
-        self.problem = self._mode_problem(now) or foreign
-        if self.problem:
-            self._held_back_at = now
-        elif now - self._held_back_at < QUIET_S:
-            self.problem = "waiting until nobody else commands the joints"
-        else:
+        reason = self._state_problem(newest)  # if there is one, the robot's own controller keeps the legs
+        if not reason:
+            self._ask_for_mode(now)
+            reason = self._mode_problem(now) or foreign
+        if reason:
+            self.problem, self._held_back_at = reason, now
+        elif now - self._held_back_at >= QUIET_S:
             self._commands.claim()
-            self._obeyed_at = now
+            self.problem, self._obeyed_at = "", now
             self.access = Access.FULL
 
     def _keep(self, now: float, newest: BoardState | None, foreign: str) -> None:
