@@ -90,6 +90,8 @@ $(VENV)/.lint: $(VENV)/.run
 
 $(VENV)/.test: $(VENV)/.run
 	$(PY) $(INSTALL) '.[eval,view,formats,test,train]'
+	@# The vendor's client of a Go2, which drives our board; OpenCV, which it names, is for its video alone.
+	$(PY) -m pip install --quiet --disable-pip-version-check --no-deps unitree-sdk2py-dimos==1.0.3
 	@touch $@
 
 # The wheels are only for x86-64, and our interfaces are compiled: both are checked before the installation.

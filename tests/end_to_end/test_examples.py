@@ -80,6 +80,7 @@ NODES = [
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r low_cmd:=/test/low_cmd", served=True),
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel", served=True),
     Step("quadvel run driver --ros-args -p dry_run:=true", served=True),
+    Step("quadvel run driver --ros-args -p robot:=go2 -p dry_run:=true", served=True),
     Step("quadvel run command_mux --ros-args -p stamped:=true", served=True),
     Step("quadvel run person_tracker --ros-args -p laser_x:=0.25", served=True),
     Step("quadvel run follow_planner --ros-args -p laser_x:=0.25 -p side:=left", served=True),
@@ -121,6 +122,9 @@ LEFT_OUT = {
     "quadvel up --low-level aliengo": "needs the robot",
     "quadvel run driver": "the same",
     "quadvel run driver --ros-args -p calibration:=calibration.yaml": "the same",
+    "quadvel run board --ros-args -p robot:=go2 -p state_rate:=500 -p hung:=true": "all of this machine share DDS domain 1; "
+    "tests/end_to_end/test_go2_nodes.py runs both in a domain of its own",
+    "quadvel run driver --ros-args -p robot:=go2 -p dds_domain:=1 -p interface:=lo": "the same",
     "quadvel twin dry_gears --out out/twin": "minutes; tests/end_to_end/test_twin.py runs a shorter script",
     "quadvel twin my_plant.yaml": "the same with a plant of the user's",
     "quadvel eval --grid quick --out out/eval": "minutes; tests/quadvel_eval/test_grid.py runs some of its walks",

@@ -17,6 +17,7 @@ from quadvel_driver import wire
 from quadvel_driver.aliengo import ALIENGO
 from quadvel_driver.board_state import BoardState
 from quadvel_driver.link import Link, LinkConfig, Transport
+from quadvel_driver.unitree_dds import wire as dds_wire
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_eval.robot_loop import RobotLoop
 from quadvel_policy.policy_file import PolicyFile
@@ -53,20 +54,18 @@ class Wire(Transport):
 class BehindNetwork:
     """A simulator as its driver shows it: what it reports and is told goes through packets and a bad network."""
 
-    def __init__(self, network: NetworkConfig) -> None:
+    def __init__(self, network: NetworkConfig, packets: Any) -> None:
+        self._packets = packets
         self._simulator = Simulator()
         self._simulator.reset("stand")
         self._there, self._back = BadNetwork(network, 0), BadNetwork(network, 1)
         self._wire = Wire()
         self._newest: RobotState | None = None
         self.time = 50.0
-        self.link = Link(ALIENGO, wire, self._wire, LinkConfig(), self._on_state, clock=lambda: self.time)
+        self.link = Link(ALIENGO, packets, self._wire, LinkConfig(), self._on_state, clock=lambda: self.time)
         self._warming_up = True
         self.step(300)  # the link finds out in what unit the board counts
         self._warming_up = False
-
-    def close(self) -> None:
-        self._wire.close()
 
     def _on_state(self, state: BoardState) -> None:
         self._newest = state.robot
@@ -101,7 +100,7 @@ class BehindNetwork:
         state = self._simulator.state()
         state.tick = 1000 + self._simulator.steps
         twelve = np.full(12, 10)
-        self._back.send(wire.encode_state(BoardState(state, twelve, twelve, twelve)), self.time)
+        self._back.send(self._packets.encode_state(BoardState(state, twelve, twelve, twelve)), self.time)
 
     def _exchange(self) -> None:
         self._wire.came.extend(self._back.pop_arrived(self.time))
@@ -110,7 +109,7 @@ class BehindNetwork:
             self._there.send(self._wire.sent.popleft(), self.time)
         for packet in self._there.pop_arrived(self.time):
             if not self._warming_up:
-                self._simulator.command(wire.decode_command(packet))
+                self._simulator.command(self._packets.decode_command(packet))
 
 
 def walked(simulator: Any, velocity: tuple[float, float, float]) -> np.ndarray:
@@ -128,21 +127,22 @@ def walked(simulator: Any, velocity: tuple[float, float, float]) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "velocity",
+    ("packets", "velocity"),
     [
-        (0.5, 0.0, 0.0),
-        *(pytest.param(one, marks=pytest.mark.long) for one in ((1.0, 0.0, 0.5), (0.0, 0.4, 0.0))),
+        (wire, (0.5, 0.0, 0.0)),
+        pytest.param(wire, (1.0, 0.0, 0.5), marks=pytest.mark.long),
+        pytest.param(wire, (0.0, 0.4, 0.0), marks=pytest.mark.long),
+        pytest.param(dds_wire, (0.5, 0.0, 0.0), marks=pytest.mark.long),
     ],
 )
 def test_with_2_percent_loss_and_2_ms_jitter_tracking_is_within_2_cm_per_s(
-    velocity: tuple[float, float, float],
+    packets: Any, velocity: tuple[float, float, float]
 ) -> None:
     plain = Simulator()
     plain.reset("stand")
-    behind = BehindNetwork(BAD)
+    behind = BehindNetwork(BAD, packets)
     without, through = walked(plain, velocity), walked(behind, velocity)
     counts = behind.link.report().counts
-    behind.close()
     assert counts["late"] > 100
     assert counts["command_timeouts"] == 0
     np.testing.assert_allclose(through, without, atol=0.02)

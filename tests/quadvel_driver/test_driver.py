@@ -337,6 +337,7 @@ def test_ctrl_c_ends_it_cleanly_and_leaves_the_joints_damped(
     [
         ({"board_address": "300.1.1.1"}, "no link from any address:0 to 300.1.1.1:"),
         ({"interface": "nosuch0"}, "no link from any address:0 on nosuch0 to 127.0.0.1:"),
+        ({"robot": "go2", "interface": "nosuch0"}, "no link to DDS domain 0 on nosuch0: "),
         ({"calibration": "/nowhere.yaml"}, "cannot read /nowhere.yaml: No such file"),
         ({"state_rate": 2000}, "state_rate: found 2000, expected a whole number, 50 to 1000"),
         ({"command_timeout": 2.0}, "command_timeout: found 2.0, expected above 0 and at most 0.5"),

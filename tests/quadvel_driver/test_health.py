@@ -6,7 +6,7 @@ import attrs
 import pytest
 
 from quadvel_driver.aliengo import ALIENGO
-from quadvel_driver.board_state import BoardState
+from quadvel_driver.board_state import Battery, BoardState
 from quadvel_driver.health import Health, Level, diagnostic_values
 from quadvel_driver.link import COUNTER_NAMES, LinkReport
 
@@ -73,6 +73,7 @@ def test_all_is_well_where_commands_are_followed_and_where_none_come() -> None:
             "3 datagrams dropped in the last second, the last: state: CRC is",
         ),
         ({"counts": {"command_timeouts": 1}}, Level.WARN, "low_cmd stopped: the joints were damped"),
+        ({"takeover": "another program"}, Level.ERROR, "another program"),
         ({"stopped": True}, Level.WARN, "stopped by the remote; R1 + L1 + START release it"),
     ],
 )
@@ -90,6 +91,13 @@ def test_a_motor_that_dropped_out_is_named_before_anything_less() -> None:
     level, sentence = judged(newest=newest, stopped=True)
     assert level == Level.ERROR
     assert sentence.startswith("RR_thigh_joint has dropped out (mode 8, error 4): stop the robot")
+
+
+def test_a_battery_that_is_low_is_named_and_each_is_reported() -> None:
+    assert judged(newest=attrs.evolve(standing(1), battery=Battery(15, 26.0, -3.0)))[0] == Level.OK
+    low = attrs.evolve(standing(1), battery=Battery(14, 26.0, -3.0))
+    assert judged(newest=low) == (Level.WARN, "the battery is at 14 %: lie down and charge it")
+    assert diagnostic_values(WELL, low, ALIENGO)["battery"] == "14 %, 26.0 V, -3.0 A"
 
 
 def test_only_what_is_new_since_the_last_report_counts() -> None:

@@ -184,6 +184,41 @@ def test_each_reason_against_a_takeover_is_one_sentence_and_nothing_is_sent(
     assert (driver.joints.sent, robot.claimed) == ([], 0)
 
 
+def test_an_old_answer_of_the_switcher_does_not_count(robot: Robot) -> None:
+    robot.writers = [ANOTHER]
+    driver = Driver(robot)
+    driver.run(2.0)
+    assert robot.mode == ""
+    robot.answers_requests = False
+    driver.run(takeover.ANSWER_TIMEOUT_S + 1.0, LONG_TURN_S)
+    robot.writers = []
+    driver.run(3.0)
+    assert "the motion switcher has not answered for 3 s" in driver.problem()
+    assert robot.claimed == 0
+
+
+def test_a_release_that_failed_once_does_not_count_after_another_has_released(robot: Robot) -> None:
+    robot.codes = {Api.RELEASE_MODE: 7}
+    driver = Driver(robot)
+    driver.run(2.0)
+    assert "error 7" in driver.problem()
+    robot.mode = ""
+    driver.run(3.0)
+    assert robot.claimed == 1
+
+
+def test_a_robot_that_falls_silent_is_not_taken_over(robot: Robot) -> None:
+    robot.releases = False
+    driver = Driver(robot)
+    driver.run(3.0)
+    robot.mode = ""
+    for _ in range(300):
+        driver.now += TURN_S
+        driver.link.serve()
+    assert driver.problem() == "no state of the robot"
+    assert (driver.joints.sent, robot.claimed) == ([], 0)
+
+
 def test_with_a_low_battery_the_robots_own_controller_keeps_the_legs(robot: Robot) -> None:
     Driver(robot, charge=5).run(3.0)
     assert (robot.mode, robot.asked) == ("mcf", [])

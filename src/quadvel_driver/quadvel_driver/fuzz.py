@@ -1,6 +1,7 @@
 """Fuzzer of the packet decoders: `python -m quadvel_driver.fuzz --datagrams 10000000`. For developers.
 
-A fuzzer chooses bytes, from which three kinds of datagrams are made: raw bytes, packets with
+Both formats are tried: UDP packets of the AlienGo (`wire`) and DDS samples of the Go2
+(`unitree_dds.wire`). A fuzzer chooses bytes, from which three kinds of datagrams are made: raw bytes, packets with
 changed bytes, and packets with changed bytes and a valid CRC, which reach the checks of the fields.
 A decoder must return a record or raise WireError. A packet that it accepts must have the right CRC,
 by an independent computation, and finite numbers.
@@ -16,6 +17,7 @@ import random
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module, util
 from typing import Any
@@ -30,7 +32,7 @@ from .packets import WireError
 RAW, CHANGED, VALID_CRC = range(3)
 HEADER_BYTES = 2  # bytes that select the kind of datagram and the packet
 CHANGE_BYTES = 3  # bytes per change: two for the position, one for the value
-MAX_BYTES = 1000  # bytes, longer than any packet
+MAX_BYTES = 1400  # bytes, longer than any packet
 
 
 def _crc_table() -> list[int]:
@@ -80,18 +82,47 @@ def _state() -> BoardState:
     return BoardState(robot, twelve, 0 * twelve, 3 * twelve, 40, Remote(Button.L1, lx=0.5))
 
 
+def aliengo_covered(packet: bytes) -> bytes:
+    """Return the bytes of an AlienGo's packet that its CRC covers: whole words without the CRC."""
+    return packet[: len(packet) // 4 * 4 - 4]
+
+
+def go2_covered(sample: bytes) -> bytes:
+    """Return the bytes that the CRC of a Go2's sample covers: the C structure without the CRC.
+
+    The structure is the body of the sample with the padding that aligns the first motor.
+    """
+    covered = bytearray(sample[4:-4])
+    for place, padding in ((22, 2), (26, 2)) if len(sample) < 1000 else ((77, 3), (83, 1)):
+        covered[place:place] = bytes(padding)
+    return bytes(covered[: len(covered) // 4 * 4])
+
+
 class FuzzTarget:
-    """Both decoders under test.
+    """All decoders under test.
 
     Attributes:
-        counts: Number of datagrams, accepted and refused.
+        counts: Number of datagrams, and of decodings that were accepted and refused.
     """
 
-    def __init__(self, wire: Any) -> None:
-        self._wire = wire
+    def __init__(self, *formats: tuple[Any, Callable[[bytes], bytes]]) -> None:
+        """Create a target.
+
+        Args:
+            formats: Each a module with decoders and encoders, and a function that returns the bytes
+                of a packet that its CRC covers.
+        """
         command = JointCommand(q=np.ones(12), kp=np.full(12, 30.0), kd=np.ones(12))
-        self._packets = wire.encode_command(command), wire.encode_state(_state())
-        self._decoders = wire.decode_command, wire.decode_state
+        self._packets = [
+            (packet, covered)
+            for wire, covered in formats
+            for packet in (wire.encode_command(command), wire.encode_state(_state()))
+        ]
+        self._decoders = [
+            (decode, covered)
+            for wire, covered in formats
+            for decode in (wire.decode_command, wire.decode_state)
+        ]
         self.counts: Counter[str] = Counter()
 
     def make_datagram(self, chosen: bytes) -> bytes:
@@ -107,16 +138,17 @@ class FuzzTarget:
         rest = chosen[HEADER_BYTES:]
         if kind % 3 == RAW:
             return rest
-        packet = bytearray(self._packets[which % 2])
+        original, covered = self._packets[which % len(self._packets)]
+        packet = bytearray(original)
         for i in range(0, len(rest) - CHANGE_BYTES + 1, CHANGE_BYTES):
             place = int.from_bytes(rest[i : i + 2], "little") % len(packet)
             packet[place] = rest[i + 2]
         if kind % 3 == VALID_CRC:
-            packet[-4:] = reference_crc(bytes(packet[: _crc_length(packet)])).to_bytes(4, "little")
+            packet[-4:] = reference_crc(covered(bytes(packet))).to_bytes(4, "little")
         return bytes(packet)
 
     def __call__(self, chosen: bytes) -> None:
-        """Decode one datagram with both decoders.
+        """Decode one datagram with all decoders.
 
         Args:
             chosen: Bytes that the fuzzer chose.
@@ -125,14 +157,14 @@ class FuzzTarget:
             AssertionError: A decoder accepted a wrong CRC or a number that is not finite.
         """
         data = self.make_datagram(chosen)
-        for decode in self._decoders:
+        for decode, covered in self._decoders:
             try:
                 record = decode(data)
             except WireError:
                 self.counts["refused"] += 1
                 continue
             self.counts["accepted"] += 1
-            assert int.from_bytes(data[-4:], "little") == reference_crc(data[: _crc_length(data)]), (
+            assert int.from_bytes(data[-4:], "little") == reference_crc(covered(data)), (
                 "a wrong CRC was accepted"
             )
             robot = getattr(record, "robot", record)
@@ -140,10 +172,6 @@ class FuzzTarget:
                 "numbers that are not finite were accepted"
             )
         self.counts["datagrams"] += 1
-
-
-def _crc_length(packet: bytes | bytearray) -> int:
-    return len(packet) // 4 * 4 - 4
 
 
 def fuzz_at_random(target: FuzzTarget, datagrams: int, seed: int = 0) -> None:
@@ -174,10 +202,13 @@ def main() -> None:
     watched: AbstractContextManager[object] = nullcontext()
     if guided:
         atheris = import_module("atheris")
-        watched = atheris.instrument_imports(include=["quadvel_driver.wire"])
+        watched = atheris.instrument_imports(
+            include=["quadvel_driver.wire", "quadvel_driver.unitree_dds.wire"]
+        )
     with watched:
         from quadvel_driver import wire
-    target, start = FuzzTarget(wire), time.monotonic()
+        from quadvel_driver.unitree_dds import wire as dds_wire
+    target, start = FuzzTarget((wire, aliengo_covered), (dds_wire, go2_covered)), time.monotonic()
 
     def say() -> None:
         elapsed = time.monotonic() - start

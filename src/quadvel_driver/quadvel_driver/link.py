@@ -212,13 +212,14 @@ class Link:
                 self.serve()
             self._send_shutdown_packets()
         finally:
-            self._takeover.close()
             self._transport.close()
 
     def serve(self) -> None:
         """Receive pending packets and send if due; for callers with a clock of their own instead of `run`."""
         self._receive()
-        self._takeover.update(self._clock(), self._newest)
+        now = self._clock()
+        is_silent = now - self._last_state_at > SILENCE_LIMIT_S
+        self._takeover.update(now, None if is_silent else self._newest)
         self._send_if_due()
 
     def stop(self) -> None:

@@ -33,8 +33,5 @@ class Takeover:
 
         Args:
             now: Time, s.
-            newest: The newest state, None before the first one.
+            newest: The newest state, None while the board is silent.
         """
-
-    def close(self) -> None:
-        """Give the joints back."""

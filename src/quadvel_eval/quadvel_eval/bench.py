@@ -12,6 +12,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
+from functools import partial
 from importlib import metadata
 from typing import Any
 
@@ -26,6 +27,7 @@ from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
 from quadvel_driver.board_state import BoardState
+from quadvel_driver.unitree_dds import wire as dds_wire
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_nodes.number_text import number_text
 from quadvel_policy.policy_file import PolicyFile
@@ -204,21 +206,23 @@ def bench_estimator() -> dict[str, Any]:
 
 
 def bench_packets() -> dict[str, Any]:
-    """Time encoding and decoding of the robot's command and state packets.
+    """Time encoding and decoding of command and state packets, of the AlienGo and of the Go2.
 
     Returns:
-        Medians, us.
+        Medians, us; the names of the Go2's start with `go2_`.
     """
     twelve = np.full(12, 10)
     state = BoardState(make_simulator(Setup(), seed=0).state(), twelve, twelve, twelve)
     command = JointCommand(q=NOMINAL_Q.copy(), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
-    of_state, of_command = wire.encode_state(state), wire.encode_command(command)
-    jobs: dict[str, Callable[[], object]] = {
-        "encode_command": lambda: wire.encode_command(command),
-        "decode_state": lambda: wire.decode_state(of_state),
-        "encode_state": lambda: wire.encode_state(state),
-        "decode_command": lambda: wire.decode_command(of_command),
-    }
+    jobs: dict[str, Callable[[], object]] = {}
+    for robot, packets in (("", wire), ("go2_", dds_wire)):
+        of_state, of_command = packets.encode_state(state), packets.encode_command(command)
+        jobs |= {
+            f"{robot}encode_command": partial(packets.encode_command, command),
+            f"{robot}decode_state": partial(packets.decode_state, of_state),
+            f"{robot}encode_state": partial(packets.encode_state, state),
+            f"{robot}decode_command": partial(packets.decode_command, of_command),
+        }
     return {f"{name}_p50_us": _percentiles(_time_calls(job, 5000))["p50_us"] for name, job in jobs.items()}
 
 
@@ -299,6 +303,8 @@ PARTS: dict[str, Benchmark] = {
         (
             ("encode_command_p50_us", "command to packet, median, us", "60 or less"),
             ("decode_state_p50_us", "packet to state, median, us", "60 or less"),
+            ("go2_encode_command_p50_us", "the same for a Go2: command to sample", "60 or less"),
+            ("go2_decode_state_p50_us", "sample to state", "60 or less"),
             ("encode_state_p50_us", "state to packet, median, us", "60 or less"),
             ("decode_command_p50_us", "packet to command, median, us", "60 or less"),
         ),

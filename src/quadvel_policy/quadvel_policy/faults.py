@@ -52,6 +52,10 @@ whose IMU freezes while it walks brakes without orientation, and falls in about 
 
 If the controller dies or hangs and sends no commands, the next component brakes: the driver after its
 `command_timeout`, the robot's board and the simulator 20 ms after the last packet.
+
+On a Go2, the driver stops the joints without the controller if another program writes `rt/lowcmd` or is connected to
+it, or if the robot's own controller is back: it brakes for half a second, then sends nothing until it is started again.
+Its sentence is on `/diagnostics` and in `quadvel status` ([robot_go2.md](robot_go2.md)).
 """
 
 

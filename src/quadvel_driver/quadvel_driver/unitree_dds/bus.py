@@ -65,6 +65,7 @@ class Bus:
             raise LinkError(f"no link to {self.name}: {error}") from error
         self._topics: dict[str, Topic[Any]] = {}
         self._waiting = WaitSet(self._participant)
+        self._others: dict[str, tuple[Any, list[RemoteWriter]]] = {}  # by topic, of which endpoints
 
     def writer(self, topic: str, kind: Any) -> Writer:
         """Create a reliable writer that keeps the last sample, as the vendor's library does.
@@ -108,12 +109,16 @@ class Bus:
         Returns:
             The writers that DDS has discovered.
         """
-        own = self._participant.dds.guid
-        return [
-            RemoteWriter(str(found.key), str(found.participant_key))
-            for found in self._participant.endpoints("publication")
-            if found.topic_name == topic and found.participant_key != own
-        ]
+        endpoints, own = self._participant.endpoints("publication"), self._participant.dds.guid
+        seen, found = self._others.get(topic, (None, []))
+        if seen is not endpoints:  # this is asked 500 times a second, and a robot has a hundred topics
+            found = [
+                RemoteWriter(str(one.key), str(one.participant_key))
+                for one in endpoints
+                if one.topic_name == topic and one.participant_key != own
+            ]
+            self._others[topic] = endpoints, found
+        return found
 
     def wait(self, timeout: float) -> None:
         """Wait until a reader has a sample.

@@ -1,12 +1,12 @@
 """Takeover of the joints from the robot's own controller, without a fight. No ROS.
 
-nothing is sent      the battery is charged, the motion switcher has released the robot's own
-controller, nobody writes rt/lowcmd for QUIET_S
-->  full         the switcher is asked again every ASK_PERIOD_S
-->  brake only   another program wrote rt/lowcmd or has a writer of it, or the robot's own
-controller is back
-->  nothing      after BRAKE_S, until the driver is started again: two writers of
-rt/lowcmd would fight over the joints
+What is sent, in this order:
+- nothing, until the battery is charged, the motion switcher has released the robot's own controller,
+  and nobody has written `rt/lowcmd` or been connected to it for QUIET_S;
+- commands, or damping without them; the switcher is asked again every ASK_PERIOD_S;
+- damping for BRAKE_S, if another program writes `rt/lowcmd` or is connected to it, or if the robot's
+  own controller is back;
+- then nothing, until the driver is started again: two writers would fight over the joints.
 """
 
 from __future__ import annotations
@@ -72,6 +72,7 @@ class DdsTakeover(Takeover):
         self._min_battery = min_battery
         self._mode: str | None = None  # the robot's own controller, "" for none, None while unknown
         self._codes: dict[int, int] = {}  # of the last answer to each request, 0 for success
+        self._last_request = Api.CHECK_MODE
         self._asked_at = self._answered_at = -math.inf
         self._asking_since: float | None = None
         self._held_back_at = -math.inf  # when `problem` last spoke against a takeover
@@ -81,8 +82,8 @@ class DdsTakeover(Takeover):
     @override
     def update(self, now: float, newest: BoardState | None) -> None:
         foreign = self._foreign_problem()
+        self._hear_mode(now)
         if self.access is Access.FULL:
-            self._ask_for_mode(now)
             self._keep(now, newest, foreign)
         elif self._lost_at is not None:
             if now - self._lost_at > BRAKE_S:
@@ -112,6 +113,7 @@ class DdsTakeover(Takeover):
             self._lost_at, self.access = now, Access.BRAKE
             self.problem = f"{lost}: the joints were braked and let go; end it and start the driver again"
             return
+        self._ask_for_mode(now)
         if newest is not None and (newest.motor_mode != MOTOR_OFF).any():
             self._obeyed_at = now
         self.problem = ""
@@ -125,7 +127,7 @@ class DdsTakeover(Takeover):
 
     def _state_problem(self, newest: BoardState | None) -> str:
         if newest is None or newest.battery is None:
-            return "the robot's battery is not known yet"
+            return "no state of the robot"
         if newest.battery.charge < self._min_battery:
             return (
                 f"the battery is at {newest.battery.charge} %, expected at least {self._min_battery} %: "
@@ -141,32 +143,32 @@ class DdsTakeover(Takeover):
             return f"another program may command the joints ({len(writers)} silent writers of rt/lowcmd)"
         return ""
 
-    def _ask_for_mode(self, now: float) -> None:
-        """Take the answers; ask again, and release a controller that holds the legs before they are taken."""
+    def _hear_mode(self, now: float) -> None:
+        """Take the answers of the motion switcher."""
         for answer in self._switcher.answers():
             self._codes[answer.api] = answer.code
             self._answered_at = now
             if answer.api == Api.CHECK_MODE:
                 self._mode = answer.mode
+
+    def _ask_for_mode(self, now: float) -> None:
+        """Ask for the mode, and for the release of a controller that holds the legs."""
         if now - self._asked_at < ASK_PERIOD_S:
             return
         self._asked_at = now
         if self._asking_since is None:
             self._asking_since = now
-        if self._mode and self.access is Access.NONE:
-            self._switcher.ask(Api.RELEASE_MODE)
-        self._switcher.ask(Api.CHECK_MODE)
+        # One request at a time: the robot's reader may keep the last one only.
+        release = bool(self._mode) and self._last_request is Api.CHECK_MODE
+        self._last_request = Api.RELEASE_MODE if release else Api.CHECK_MODE
+        self._switcher.ask(self._last_request)
 
     def _mode_problem(self, now: float) -> str:
         """Return why the robot's own controller is not known to have let go, or "" if it has."""
         assert self._asking_since is not None
         since = now - self._asking_since
-        for api, code in self._codes.items():
-            if code:
-                return (
-                    f"the motion switcher answers request {api} with error {code}: "
-                    "this firmware does not release the legs"
-                )
+        if self._codes.get(Api.CHECK_MODE):
+            return self._refusal(Api.CHECK_MODE)
         if self._mode is None or now - self._answered_at > ANSWER_TIMEOUT_S:
             if since < ANSWER_TIMEOUT_S:
                 return "asking the robot for its mode"
@@ -174,7 +176,15 @@ class DdsTakeover(Takeover):
                 f"the motion switcher has not answered for {ANSWER_TIMEOUT_S:g} s: "
                 "firmware before 1.0.24 has none and cannot release the legs"
             )
+        if self._mode and self._codes.get(Api.RELEASE_MODE):
+            return self._refusal(Api.RELEASE_MODE)
         if self._mode:
             stubborn = f", and has not let go for {since:.0f} s" if since > RELEASE_TIMEOUT_S else ""
             return f"the robot's own controller '{self._mode}' holds the legs{stubborn}"
         return ""
+
+    def _refusal(self, api: Api) -> str:
+        return (
+            f"the motion switcher answers request {api} with error {self._codes[api]}: "
+            "this firmware does not release the legs"
+        )
