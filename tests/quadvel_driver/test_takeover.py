@@ -10,7 +10,7 @@ import pytest
 
 from quadvel_description.state import JointCommand
 from quadvel_driver.board_state import Battery, BoardState
-from quadvel_driver.link import Link, LinkConfig, Transport
+from quadvel_driver.link import SHUTDOWN_PACKETS, Link, LinkConfig, Transport
 from quadvel_driver.takeover import Access
 from quadvel_driver.unitree_dds import takeover, wire
 from quadvel_driver.unitree_dds.bus import RemoteWriter
@@ -288,6 +288,15 @@ def test_motors_that_stay_off_are_those_of_a_robot_that_is_no_edu_model(holding:
     holding.state = attrs.evolve(holding.state, motor_mode=np.zeros(12, np.uint8))
     holding.run(takeover.OBEY_TIMEOUT_S + 0.1)
     assert "only the EDU model obeys it" in holding.problem()
+
+
+def test_a_link_that_ends_by_an_error_leaves_the_joints_braking() -> None:
+    joints = Joints()
+    link = Link(GO2, wire, joints, LinkConfig(), print)
+    with pytest.raises(AssertionError, match="time is simulated"):
+        link.run()
+    assert len(joints.sent) == SHUTDOWN_PACKETS
+    assert all(map(brakes, joints.sent))
 
 
 def test_nothing_beyond_the_robots_limits_is_sent(holding: Driver) -> None:

@@ -205,14 +205,16 @@ class Link:
         self._reported_at, self._reported = clock(), Counter[str]()
 
     def run(self) -> None:
-        """Send and receive until `stop`, then brake the robot and close the connection."""
+        """Send and receive until `stop` or an error, then brake the robot and close the connection."""
         try:
             while not self._is_stopped:
                 self._transport.wait(self._time_until_sending())
                 self.serve()
-            self._send_shutdown_packets()
         finally:
-            self._transport.close()
+            try:
+                self._send_shutdown_packets()
+            finally:
+                self._transport.close()
 
     def serve(self) -> None:
         """Receive pending packets and send if due; for callers with a clock of their own instead of `run`."""

@@ -42,8 +42,8 @@ HOLD_PERIOD_S = 0.004
 """Period of its commands, s."""
 HOLD_KP, HOLD_KD = 100.0, 3.0
 """Its gains, N m/rad and N m s/rad: enough for the mass of the simulated AlienGo."""
-NOT_IMPLEMENTED = 3203
-"""Code of the answer to an unknown request."""
+NOT_IMPLEMENTED, WRONG_PARAMETER = 3203, 3204
+"""Codes of the answers to an unknown request and to one that cannot be read."""
 BATTERY = Battery(charge=90, voltage=29.0, current=-1.0)
 
 
@@ -124,7 +124,10 @@ class DdsBoard(Board):
         elif api == Api.RELEASE_MODE:
             self.select("")
         elif api == Api.SELECT_MODE:
-            self.select(json.loads(request.parameter)["name"])
+            try:
+                self.select(str(json.loads(request.parameter)["name"]))
+            except (ValueError, TypeError, KeyError):
+                code = WRONG_PARAMETER
         else:
             code = NOT_IMPLEMENTED
         return Response(ResponseHeader(request.header.identity, ResponseStatus(code)), data)

@@ -70,10 +70,14 @@ class MotionSwitcher:
         """Take the answers to own requests.
 
         Returns:
-            Answers, oldest first.
+            Answers, oldest first; those that cannot be read are left out.
         """
         found = []
-        for response in self._responses.dds.take(100):
+        try:
+            responses = self._responses.dds.take(100)
+        except Exception:  # the content is arbitrary, such as text that is not UTF-8, and so is the error
+            return []
+        for response in responses:
             if response.sample_info.valid_data and response.header.identity.id in self._asked:
                 self._asked.discard(response.header.identity.id)
                 found.append(read_answer(response))
