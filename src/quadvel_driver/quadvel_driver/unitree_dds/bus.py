@@ -1,4 +1,4 @@
-"""DDS bus of one robot: readers and writers of its topics, and who else writes them. No ROS.
+"""DDS bus of one robot: readers and writers of its topics. No ROS.
 
 The robot's domain is one of its own in this process, so a node may at the same time be in the ROS
 domain of the same number, on another interface.
@@ -10,7 +10,6 @@ import itertools
 import socket
 from typing import Any
 
-import attrs
 from cyclonedds.core import DDSException
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
@@ -26,19 +25,6 @@ DEPTH = 16  # samples that wait in a reader, about 30 ms of 500 Hz
 MAX_DOMAIN = 232
 # Numbers of domains in this process; on the network, `ExternalDomainId` counts.
 _LOCAL_DOMAINS = itertools.count(1000)
-
-
-@attrs.frozen
-class RemoteWriter:
-    """A writer of another program, as DDS discovers it.
-
-    Attributes:
-        key: Its identity.
-        participant: Identity of its program.
-    """
-
-    key: str
-    participant: str
 
 
 class Bus:
@@ -65,7 +51,6 @@ class Bus:
             raise LinkError(f"no link to {self.name}: {error}") from error
         self._topics: dict[str, Topic[Any]] = {}
         self._waiting = WaitSet(self._participant)
-        self._others: dict[str, tuple[Any, list[RemoteWriter]]] = {}  # by topic, of which endpoints
 
     def writer(self, topic: str, kind: Any) -> Writer:
         """Create a reliable writer that keeps the last sample, as the vendor's library does.
@@ -99,26 +84,6 @@ class Bus:
         reader = Reader(DataReader(self._participant.dds, self._topic(topic, kind), qos))
         self._waiting.update({*self._waiting.readers, reader})
         return reader
-
-    def other_writers(self, topic: str) -> list[RemoteWriter]:
-        """List the writers of other programs on a topic.
-
-        Args:
-            topic: Name of the topic.
-
-        Returns:
-            The writers that DDS has discovered.
-        """
-        endpoints, own = self._participant.endpoints("publication"), self._participant.dds.guid
-        seen, found = self._others.get(topic, (None, []))
-        if seen is not endpoints:  # this is asked 500 times a second, and a robot has a hundred topics
-            found = [
-                RemoteWriter(str(one.key), str(one.participant_key))
-                for one in endpoints
-                if one.topic_name == topic and one.participant_key != own
-            ]
-            self._others[topic] = endpoints, found
-        return found
 
     def wait(self, timeout: float) -> None:
         """Wait until a reader has a sample.

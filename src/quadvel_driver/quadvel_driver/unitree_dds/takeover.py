@@ -12,7 +12,6 @@ What is sent, in this order:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Protocol
 
 from typing_extensions import override
@@ -20,7 +19,6 @@ from typing_extensions import override
 from quadvel_driver.board_state import BoardState
 from quadvel_driver.takeover import Access, Takeover
 
-from .bus import RemoteWriter
 from .motion_switcher import Answer, Api
 from .wire import MOTOR_OFF
 
@@ -51,8 +49,8 @@ class Commands(Protocol):
     def foreign_commands(self) -> int:
         """Count the commands of other programs since the last call."""
 
-    def foreign_writers(self) -> Sequence[RemoteWriter]:
-        """List other programs' writers of commands."""
+    def foreign_writers(self) -> int:
+        """Count other programs' writers of commands, also silent ones."""
 
 
 class DdsTakeover(Takeover):
@@ -140,7 +138,7 @@ class DdsTakeover(Takeover):
         if count:
             return f"another program commands the joints ({count} samples on rt/lowcmd)"
         if writers:
-            return f"another program may command the joints ({len(writers)} silent writers of rt/lowcmd)"
+            return f"another program may command the joints ({writers} silent writers of rt/lowcmd)"
         return ""
 
     def _hear_mode(self, now: float) -> None:

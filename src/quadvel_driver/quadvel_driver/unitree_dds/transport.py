@@ -12,7 +12,7 @@ from quadvel_dds.wire import Writer
 from quadvel_description.fields import field
 from quadvel_driver.link import LinkConfig, Transport
 
-from .bus import MAX_DOMAIN, Bus, RemoteWriter
+from .bus import MAX_DOMAIN, Bus
 from .types import LOW_CMD, LOW_STATE
 
 COMMAND_TOPIC, STATE_TOPIC = "rt/lowcmd", "rt/lowstate"
@@ -77,13 +77,13 @@ class DdsTransport(Transport):
         self.counts["from_others"] += count
         return count
 
-    def foreign_writers(self) -> list[RemoteWriter]:
-        """List other programs' writers of commands, also those that have not written yet.
+    def foreign_writers(self) -> int:
+        """Count other programs' writers of commands, also those that have not written yet.
 
         Returns:
-            The writers that DDS has discovered.
+            Number of writers that DDS has discovered.
         """
-        return self._bus.other_writers(COMMAND_TOPIC)
+        return self._others.count()
 
     @override
     def wait(self, timeout: float) -> None:
