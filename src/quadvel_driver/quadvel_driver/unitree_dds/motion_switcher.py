@@ -35,7 +35,7 @@ class Answer:
     Attributes:
         api: What was asked.
         code: 0 for success.
-        mode: Name of the controller that holds the legs, "" for none; None if it is not said.
+        mode: Name of the controller that holds the legs, "" for none; None if the answer names none.
     """
 
     api: int
