@@ -73,7 +73,7 @@ lock: $(PY)  ## rewrite requirements.lock from the bounds in pyproject.toml
 	    --no-annotate --no-emit-index-url --custom-compile-command "make lock" --output-file requirements.lock
 
 clean:  ## remove both environments, out, build products and caches
-	rm -rf $(VENV) $(ROS_VENV) out build .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	rm -rf $(VENV) $(ROS_VENV) out build docs/reference/api .mypy_cache .pytest_cache .ruff_cache *.egg-info
 
 $(PY):
 	@command -v "$(PYTHON)" >/dev/null || { \

@@ -6,6 +6,7 @@ import os
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import quadvel_dds
 
@@ -38,7 +39,7 @@ extensions = [
     "repository_links",
     "terminal_cells",
 ]
-exclude_patterns = ["_ext", "_static", "reference/api/modules.rst"]
+exclude_patterns = ["_ext", "_static", "reference/api/*/modules.rst"]
 suppress_warnings = ["ref.python"]  # an annotation that two modules define
 default_role = "code"  # of docstrings, which name code in single backticks
 
@@ -55,25 +56,25 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 900  # of a cell, s: ten times what an idle machine needs
 nb_merge_streams = True
 
-# The Python interface: one page for each package.
-PACKAGES = sorted(
-    path.parent
-    for path in [
-        *ROOT.glob("src/quadvel_*/quadvel_*/__init__.py"),
-        ROOT / "training/quadvel_training/__init__.py",
-    ]
+# The Python interface: a folder for each package, because apidoc removes what it did not write.
+PACKAGES = [path.parent for path in sorted(ROOT.glob("src/*/*/__init__.py"))] + [
+    ROOT / "training/quadvel_training"
+]
+UNDOCUMENTED = (
+    "src/quadvel_dds/quadvel_dds/rclpy*",  # the interface of rclpy, documented there
+    "training/quadvel_training/against_cusrl.py",  # it needs cusrl
 )
 apidoc_modules = [
     {
-        "path": str(path),
-        "destination": "reference/api",
+        "path": str(package),
+        "destination": f"reference/api/{package.name}",
+        "exclude_patterns": [str(ROOT / path) for path in UNDOCUMENTED],
         "separate_modules": True,
         "module_first": True,
         "max_depth": 1,
-        "exclude_patterns": [str(ROOT / "training/quadvel_training/against_cusrl.py")],  # it needs cusrl
         "automodule_options": {"members", "show-inheritance"},
     }
-    for path in PACKAGES
+    for package in PACKAGES
 ]
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
@@ -102,3 +103,32 @@ html_css_files = ["site.css"]
 html_show_sourcelink = False
 html_copy_source = False
 copybutton_exclude = ".linenos, .gp, .go"
+
+
+def setup(app: Any) -> None:
+    """Read docstrings as the plain text that they are.
+
+    Args:
+        app: The build.
+    """
+    app.connect("autodoc-process-docstring", keep_text)
+
+
+def keep_text(app: Any, what: str, name: str, subject: Any, options: Any, lines: list[str]) -> None:
+    """Keep bars of absolute values, and the lines that follow Typer's control character up to the next empty one.
+
+    Args:
+        app: The build.
+        what: Kind of what is documented.
+        name: Its name.
+        subject: What is documented.
+        options: Options of the directive.
+        lines: Its docstring; changed.
+    """
+    kept = False
+    for number, line in enumerate(lines):
+        if line.strip() in ("\b", ""):
+            kept = line.strip() == "\b"
+            lines[number] = ""
+        else:
+            lines[number] = ("| " if kept else "") + line.replace("|", r"\|")

@@ -100,16 +100,6 @@ def effects() -> str:
     return "\n".join(["| effect | equation | parameters |", "|---|---|---|", *rows])
 
 
-def packages() -> str:
-    """Return the table of contents of the Python interface.
-
-    Returns:
-        A directive of MyST, with one entry for each package.
-    """
-    names = [*sorted(path.parent.name for path in ROOT.glob("src/*/*/__init__.py")), "quadvel_training"]
-    return "\n".join(["```{toctree}", ":maxdepth: 1", "", *(f"api/{name}" for name in names), "```"])
-
-
 def citations() -> str:
     """Return the places of the code that cite the paper.
 
@@ -129,7 +119,7 @@ def citations() -> str:
 
 
 PARTS: dict[str, Callable[[], str]] = {
-    part.__name__: part for part in (commands, nodes, parameters, messages, effects, packages, citations)
+    part.__name__: part for part in (commands, nodes, parameters, messages, effects, citations)
 }
 
 

@@ -419,8 +419,8 @@ COUNTER_NAMES = (
 )
 """Counts of a report, since the start.
 
-states: passed to `on_state`; sent: packets; superseded: states replaced by a newer one in the same
-    turn;
+states: passed to `on_state`; sent: packets;
+superseded: states replaced by a newer one in the same turn;
 repeated, late: see `BoardClock`; wrong_length, wrong_crc, unusable, from_others: refused packets;
 command_timeouts: times that commands stopped; board_restarts: restarts of the board's counter;
 network_errors: errors of the connection.

@@ -1,8 +1,7 @@
 """The plant of `quadvel twin`: a simulated robot with a hidden effect in its drives.
 
 The stack's model lacks that effect. The plant runs in its own process, which alone reads its
-configuration: python -m quadvel_lab.plant FILE --ros-args ... The physics is written from
-    mechanics
+configuration: python -m quadvel_lab.plant FILE --ros-args ... The physics is written from mechanics
 and circuit theory, separately from the effects that identification fits.
 """
 

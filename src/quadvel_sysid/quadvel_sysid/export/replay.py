@@ -103,7 +103,7 @@ class Replay:
             after: Corrected model.
 
         Returns:
-            `{"replay": ...}` or `{"motion": ...}` in the format of report.json.
+            A dict with the key `replay` or `motion`, in the format of report.json.
         """
         rows = self.prepared.parts.report
         return self.load.report_section(self._errors(before, rows), self._errors(after, rows))
