@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from quadvel_description.arrays import Array, Floats
+from quadvel_description.arrays import Array, Floats, Indices
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import MODE_DAMPING
 from quadvel_eval.recording import Series, planar
@@ -100,13 +100,22 @@ def _own_commands(messages: Sequence[Any], states: Sequence[Any], start: float) 
     messages = sorted(messages, key=lambda m: seconds(m.stamp))
     ticks = np.array([m.tick for m in states])
     answers = np.searchsorted(ticks, [m.tick for m in messages], side="right") - 1
+    answers = np.maximum(answers, 0)
     fields = {field: _rows(messages, field) for field in ("q", "dq", "tau", "kp", "kd")}
+    stamps, state_stamps = (np.array([seconds(m.stamp) for m in each]) for each in (messages, states))
+    # A simulated clock stands still between states: stamps of commands are then those of some state, and say nothing.
+    if np.isin(_microseconds(stamps), _microseconds(state_stamps)).all():
+        stamps = state_stamps[answers]
     return Commands(
-        time=np.array([seconds(m.stamp) for m in messages]) - start,
-        answers=np.maximum(answers, 0),
+        time=stamps - start,
+        answers=answers,
         servo=np.array([m.mode != MODE_DAMPING for m in messages]),
         **fields,
     )
+
+
+def _microseconds(stamps: Array) -> Indices:
+    return np.round(1e6 * stamps).astype(np.int64)
 
 
 def _other_series(found: Messages, start: float) -> dict[str, Any]:

@@ -131,7 +131,8 @@ class Signals:
         """
         run = self.run
         dt = np.diff(run.time)[:, None]
-        steps = dt[:, 0] < 2.5 * run.period
+        # Repeated states show no motion, and the states after them that of two periods.
+        steps = (dt[:, 0] < 2.5 * run.period) & ~self.repeated[1:] & ~self.repeated[:-1]
         slope = (np.diff(run.q, axis=0) / dt)[steps]
         speed = (0.5 * (run.dq[1:] + run.dq[:-1]))[steps]
         found = np.full(len(run.joints), np.nan)

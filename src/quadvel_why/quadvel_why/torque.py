@@ -99,15 +99,16 @@ class ExactModel:
             keep = (rows >= 0) & run.commands.servo[np.maximum(rows, 0)] & np.isfinite(run.q).all(axis=1)
             if keep.sum() < MIN_EXACT_ROWS:
                 continue
-            kp, kd, q_des, ff = (getattr(run.commands, f)[rows[keep]] for f in ("kp", "kd", "q", "tau"))
-            tau, q, dq = run.tau[keep], run.q[keep], run.dq[keep]
+            kp, q_des, ff = (getattr(run.commands, f)[rows[keep]] for f in ("kp", "q", "tau"))
+            tau, q = run.tau[keep], run.q[keep]
+            damping = run.commands.kd[rows[keep]] * (run.commands.dq[rows[keep]] - run.dq[keep])
             pairs = np.empty((joints, joints))
             for j in range(joints):
-                asked = kp[:, j, None] * (q_des[:, j, None] - q) + ff[:, j, None] - kd[:, j, None] * dq
+                asked = kp[:, j, None] * (q_des[:, j, None] - q) + ff[:, j, None] + damping
                 pairs[:, j] = np.mean((tau - np.clip(asked, -limit, limit)) ** 2, axis=0)
-            against = np.clip(kp * (-q_des - q) - ff - kd * dq, -limit, limit)
+            against = np.clip(kp * (-q_des - q) - ff + damping, -limit, limit)
             flipped = np.mean((tau - against) ** 2, axis=0)
-            own = np.clip(kp * (q_des - q) + ff - kd * dq, -limit, limit)
+            own = np.clip(kp * (q_des - q) + ff + damping, -limit, limit)
             turned = np.mean((tau + own) ** 2, axis=0)
             best = float(np.minimum(np.minimum(pairs.min(axis=1), flipped), turned).sum())
             found.append(
@@ -150,10 +151,11 @@ class TorqueModel:
         return np.arange(0.0, MAX_DELAY_S + 1e-9, DELAY_STEP_S)
 
     def _products(self, delay: float) -> tuple[Array, Array, Array]:
-        """Kp q_des + tau_ff, kp and kd, each (n, J), of the commands that act at this delay."""
+        """Asked torque at angle 0 without damping, kp, and kd (dq_des - dq), each (n, J), of the commands of this delay."""
         commands, rows = self.run.commands, np.maximum(self.run.command_rows(delay), 0)
         kp = commands.kp[rows]
-        return kp * commands.q[rows] + commands.tau[rows], kp, commands.kd[rows]
+        damping = commands.kd[rows] * (commands.dq[rows] - self.run.dq)
+        return kp * commands.q[rows] + commands.tau[rows], kp, damping
 
     @cached_property
     def own_errors(self) -> Array:
@@ -169,7 +171,7 @@ class TorqueModel:
     def _errors(self, pairs: Sequence[tuple[int, int]]) -> Array:
         """Mean square errors (delays, pairs) after a free fit of a_1, a_2, a_3 and b."""
         keep, run = self.rows, self.run
-        tau, q, dq = run.tau[keep], run.q[keep], run.dq[keep]  # type: ignore[index]
+        tau, q = run.tau[keep], run.q[keep]  # type: ignore[index]
         found, before = np.empty((len(self.delays), len(pairs))), None
         for d, delay in enumerate(self.delays):
             rows = run.command_rows(float(delay))[keep]
@@ -177,9 +179,9 @@ class TorqueModel:
                 found[d] = found[d - 1]
                 continue
             before = rows
-            asked, kp, kd = (each[keep] for each in self._products(float(delay)))
+            asked, kp, damping = (each[keep] for each in self._products(float(delay)))
             for k, (i, j) in enumerate(pairs):
-                x = _regressors(asked[:, j], kp[:, j], kd[:, j], q[:, i], dq[:, i])
+                x = _regressors(asked[:, j], kp[:, j], damping[:, j], q[:, i])
                 gram, right = x.T @ x, x.T @ tau[:, i]
                 weights = np.linalg.solve(gram + 1e-9 * np.trace(gram) * np.eye(REGRESSORS), right)
                 found[d, k] = np.mean((tau[:, i] - x @ weights) ** 2)
@@ -212,9 +214,8 @@ class TorqueModel:
         Returns:
             kp (q_des - q) + kd (dq_des - dq) + tau_ff, (n, J), N m.
         """
-        run, rows = self.run, np.maximum(self.run.command_rows(delay), 0)
-        asked, kp, kd = self._products(delay)
-        return np.asarray(asked - kp * run.q + kd * (run.commands.dq[rows] - run.dq))
+        asked, kp, damping = self._products(delay)
+        return np.asarray(asked - kp * self.run.q + damping)
 
     @cached_property
     def fits(self) -> list[DriveFit]:
@@ -224,8 +225,8 @@ class TorqueModel:
     def _fit(self, i: int) -> DriveFit:
         """Least squares on rows of little torque, then on all rows that these explain."""
         run, keep = self.run, self.rows
-        asked, kp, kd = (each[keep][:, i] for each in self._products(self.delay))
-        x, y = _regressors(asked, kp, kd, run.q[keep][:, i], run.dq[keep][:, i]), run.tau[keep][:, i]  # type: ignore[index]
+        asked, kp, damping = (each[keep][:, i] for each in self._products(self.delay))
+        x, y = _regressors(asked, kp, damping, run.q[keep][:, i]), run.tau[keep][:, i]  # type: ignore[index]
         little = np.abs(self.asked[keep][:, i]) < LITTLE_TORQUE_NM
         use = little if little.sum() >= MIN_ROWS else np.ones(len(y), bool)
         weights = np.zeros(REGRESSORS)
@@ -245,16 +246,16 @@ class TorqueModel:
     def modelled(self) -> Array:
         """Torque that the fits explain at every state, (n, J), N m."""
         run = self.run
-        asked, kp, kd = self._products(self.delay)
+        asked, kp, damping = self._products(self.delay)
         return np.column_stack(
             [
-                _regressors(asked[:, i], kp[:, i], kd[:, i], run.q[:, i], run.dq[:, i])
+                _regressors(asked[:, i], kp[:, i], damping[:, i], run.q[:, i])
                 @ np.array([fit.command, fit.angle, fit.speed, fit.offset])
                 for i, fit in enumerate(self.fits)
             ]
         )
 
 
-def _regressors(asked: Array, kp: Array, kd: Array, q: Array, dq: Array) -> Array:
-    """Columns of a_1, a_2, a_3 and b, (n, 4); commanded speeds are zero in every policy that we know."""
-    return np.column_stack([asked, -kp * q, -kd * dq, kp])
+def _regressors(asked: Array, kp: Array, damping: Array, q: Array) -> Array:
+    """Columns of a_1, a_2, a_3 and b, (n, 4)."""
+    return np.column_stack([asked, -kp * q, damping, kp])

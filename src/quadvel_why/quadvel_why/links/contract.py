@@ -22,6 +22,7 @@ UNEXPLAINED_SHARE = 0.1
 """Share of a torque's variance that its own command leaves if another one is meant."""
 BETTER_PAIRING, MIN_ERROR_N2M2 = 4.0, 4.0
 """Factor by which another command explains the torque better, and the smallest error that needs it."""
+MAX_SPREAD_AT_REST_RAD = 0.02
 EXPLAINED_SHARE = 0.3
 """Share of the mean square torque that a sign may leave."""
 MIN_SHARE_USED = 0.85
@@ -73,7 +74,7 @@ class JointScale(Cause):
 
     link = Link.CONTRACT
     unit = "factor minus 1"
-    least = 0.08
+    least = 0.15
     remedy = "Turn one joint by a known angle by hand and read it in `quadvel status`; correct the unit in the driver"
 
     @override
@@ -302,7 +303,9 @@ class JointOffset(Cause):
         keep = (rows >= 0) & run.commands.servo[np.maximum(rows, 0)]
         off = (signals.torque.asked_at(exact.delay) - run.tau)[keep] / run.commands.kp[rows[keep]]
         middle = np.median(off, axis=0)
-        doubt = 5.0 * 1.4826 * np.median(np.abs(off - middle), axis=0) / math.sqrt(len(off))
+        spread = 1.4826 * np.median(np.abs(off - middle), axis=0)
+        middle = np.where(spread < MAX_SPREAD_AT_REST_RAD, middle, 0.0)
+        doubt = 5.0 * spread / math.sqrt(len(off))
         j = int(np.argmax(np.abs(middle) - doubt))
         sentence = (
             f"{run.joints[j]}: {-middle[j]:+.3f} rad between the drive's angle and the recorded one, at rest"

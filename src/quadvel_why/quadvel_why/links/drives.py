@@ -25,7 +25,7 @@ FLAT_SHARE, FALLS = 0.05, -0.4
 REST_WINDOW_S = 0.5
 REST_RAD_S, MOVING_RAD_S = 0.25, 0.6
 """Speed of a joint at rest, and median speed of all joints of a robot that moves."""
-HEALTHY_REST_SHARES = (0.42, 0.23, 0.19)
+HEALTHY_REST_SHARES = (0.68, 0.32, 0.19)
 """Largest surplus of the time at rest of a hip, thigh and calf in healthy walks."""
 
 
