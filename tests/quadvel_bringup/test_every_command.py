@@ -46,6 +46,7 @@ NEEDED = {
     "replay": ["walk.mcap"],
     "run": ["sim_node"],
     "twin": ["dry_gears"],
+    "why": [LOG],
     "world": ["park"],
 }
 """What a command, or one of its options, needs besides the value that is wrong"""
@@ -246,10 +247,12 @@ def suffixes(place: Place) -> tuple[str, ...]:
     """Names under which a parameter's file may come: readers choose by them."""
     if "onnx" in place.option or place.option in ("--policy", "--estimator-file", "--model"):
         return (".onnx",)
-    if place.command in ("identify", "plot", "replay", "calibrate", "view") and place.option in (
+    if place.command in ("identify", "plot", "replay", "calibrate", "view", "why") and place.option in (
         "logs", "--holdout", "recording", "--hung", "--standing"
     ):  # fmt: skip
-        return (".mcap", ".npz", ".csv", ".json", "") if place.command == "identify" else (".mcap", "")
+        return (
+            (".mcap", ".npz", ".csv", ".json", "") if place.command in ("identify", "why") else (".mcap", "")
+        )
     if place.option in ("first", "second", "--after"):
         return (".json",)
     return (".xml", ".urdf") if place.option == "--robot" else (".yaml",)

@@ -54,7 +54,7 @@ PIP = {
 """Distributions that bring modules; of the module's name unless given"""
 BUILD_TOOLS = {"setuptools"}
 """Of every setup.py"""
-OPTIONAL = {"quadvel_eval", "quadvel_follow", "quadvel_lab", "quadvel_sim", "quadvel_sysid"}
+OPTIONAL = {"quadvel_eval", "quadvel_follow", "quadvel_lab", "quadvel_sim", "quadvel_sysid", "quadvel_why"}
 """What quadvel_bringup names as texts: its commands and nodes refuse to start where it is not installed"""
 HEAVY = {"matplotlib", "mujoco", "numba", "onnx", "scipy", "torch"}
 OF_TOOLS = ("docs", "test", "ros", "lint")
@@ -122,8 +122,8 @@ def test_bringup_imports_no_laboratory() -> None:
 
 
 def test_what_the_laboratory_is_made_of_declares_itself_to_the_whole() -> None:
-    """colcon build --packages-up-to quadvel_lab builds all; up to quadvel_bringup, what a robot needs."""
-    assert needed("quadvel_lab") == set(PACKAGES)
+    """colcon build --packages-up-to quadvel_lab quadvel_why builds all; up to quadvel_bringup, what a robot needs."""
+    assert needed("quadvel_lab") | needed("quadvel_why") == set(PACKAGES)
     assert needed("quadvel_bringup") & OPTIONAL == set()
 
 

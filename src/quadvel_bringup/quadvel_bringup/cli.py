@@ -114,6 +114,12 @@ DELEGATED_COMMANDS = {
         LOGS,
         "Run actuator model and estimator offline on a recording.",
     ),
+    "why": DelegatedCommand(
+        "quadvel_why.cli:why_command",
+        "eval",
+        LOGS,
+        "Find the cause in the recording of a run that failed.",
+    ),
     "excite": DelegatedCommand(
         "quadvel_lab.excite:excite_command",
         "identify",

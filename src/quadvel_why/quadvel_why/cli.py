@@ -1,0 +1,88 @@
+"""Defines the command `quadvel why` for Typer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from quadvel_recordings.output import atomic_write, output_folder
+
+from .diagnosis import diagnose
+from .reading import read_run
+from .report import picture, summary, to_json
+from .signals import Signals
+
+
+def why_command(
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            help="A recording (MCAP, rosbag2, ROS 1), or a table of joints as `quadvel identify` reads it.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="<folder>", help="Folder for why.json and why.png.")] = Path(
+        "out/why"
+    ),
+    policy: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="<file>",
+            help="ONNX file of the policy that drove.",
+            show_default="the shipped one, for a recording of this stack",
+        ),
+    ] = None,
+    gains: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="<kp kd>",
+            help="Commanded gains, N m/rad and N m s/rad, if the recording holds none.",
+            show_default="none",
+        ),
+    ] = None,
+) -> None:
+    """Find out why a recorded run failed: the first link of the chain that breaks.
+
+    The chain is contract, timing, sensors, estimator, drives, ground, task. Each cause is tested against
+    physics that it cannot fake: torque against the PD law of the commands, angles against speeds,
+    orientation against gyroscope and gravity, planted feet against the trunk, and the recorded actions
+    against the policy, replayed on what was recorded. The answer names one cause, with numbers, a
+    picture of the time in which it shows, and what to do. docs/why.md lists all causes.
+
+    \b
+    For example, record until the robot falls, then ask:
+      quadvel record --out fall.mcap
+      quadvel why fall.mcap
+    with a policy of your own, or the log of another robot:
+      quadvel why fall.mcap --policy mine.onnx
+      quadvel why walk.npz --gains 35 0.5
+
+    \b
+    Exit codes:
+      0  every link holds, as far as the recording shows
+      1  a link breaks; it is named
+      2  a wrong argument or file
+    """
+    output_folder(out)
+    driver = PolicyFile(policy) if policy is not None else None
+    run = read_run(recording, gains)
+    if driver is None and run.is_own:
+        driver = PolicyFile(SHIPPED_POLICY)
+    for remark in run.remarks:
+        typer.echo(f"quadvel: warning: {recording}: {remark}", err=True)
+    diagnosis = diagnose(Signals(run, driver))
+    typer.echo(summary(run, diagnosis))
+    with atomic_write(out / "why.json") as draft:
+        draft.write_text(json.dumps(to_json(run, diagnosis), indent=1))
+    written = ["why.json"]
+    if diagnosis.finding is not None and diagnosis.finding.measurement.traces:
+        with atomic_write(out / "why.png") as draft:
+            picture(diagnosis.finding).savefig(draft, dpi=110, format="png")
+        written.append("why.png")
+    typer.echo(f"written: {out}/{', '.join(written)}")
+    if diagnosis.finding is not None:
+        raise typer.Exit(1)

@@ -1,0 +1,178 @@
+"""Finds what would make the policy give the recorded actions: the search over variants of `policy_replay`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from weakref import WeakKeyDictionary
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from quadvel_description.network_input import InputLayout
+
+from .policy_replay import Observe, PolicyReplay, Replay, Variant, term_slice
+
+AGREES_RAD = 0.02
+"""Targets that differ by less are the policy's; the velocity of another tick makes a quarter of that."""
+REPAIRED_SHARE = 0.35
+"""A hypothesis has to leave less than this share of the difference."""
+SEARCH_TICKS = 150
+RESET_TICKS = (1, 2, 3, 4, 5, 8, 10, 20, 25, 40, 50, 100)
+LATE_TICKS = (1, 2, 4, 8)
+SCALES = (0.0, 1.0 / 57.3, 0.1, 0.25, 0.5, 0.7, 1.4, 2.0, 4.0, 10.0, 57.3, -1.0)
+REORDERINGS = {
+    "left and right legs exchanged": (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8),
+    "front and rear legs exchanged": (6, 7, 8, 9, 10, 11, 0, 1, 2, 3, 4, 5),
+    "diagonal legs exchanged": (9, 10, 11, 6, 7, 8, 3, 4, 5, 0, 1, 2),
+    "FR, FL, RR, RL, grouped by kind of joint": (0, 3, 6, 9, 1, 4, 7, 10, 2, 5, 8, 11),
+    "FL, FR, RL, RR, grouped by kind of joint": (3, 0, 9, 6, 4, 1, 10, 7, 5, 2, 11, 8),
+}
+"""Orders of twelve joints that other stacks use, as indices into ours."""
+MEMORY_S = 0.7
+"""Time after which a memory that was not cleared has faded."""
+
+
+@attrs.frozen(eq=False)
+class Explanation:
+    """Which cause explains the recorded actions.
+
+    Attributes:
+        cause: Name of the cause; empty if the actions are the policy's.
+        sentence: What would make them equal.
+        error: Difference of recorded and replayed targets, rad.
+        base: The replay of the policy as its file says.
+    """
+
+    cause: str
+    sentence: str
+    error: float
+    base: Replay
+
+    @property
+    def worst_joint(self) -> int:
+        """Joint with the largest difference."""
+        off = np.where(self.base.valid, self.base.recorded - self.base.expected, 0.0)
+        return int(np.argmax((off**2).sum(axis=0)))
+
+    @staticmethod
+    def of(replay: PolicyReplay) -> Explanation:
+        """Explain a walk; the search runs once for each replay.
+
+        Args:
+            replay: The policy on the run.
+
+        Returns:
+            The explanation.
+        """
+        if replay not in _FOUND:
+            _FOUND[replay] = _explain(replay)
+        return _FOUND[replay]
+
+
+_FOUND: WeakKeyDictionary[PolicyReplay, Explanation] = WeakKeyDictionary()
+
+
+def _explain(replay: PolicyReplay) -> Explanation:
+    base = replay.base
+    error = base.error
+    if not error > AGREES_RAD:
+        return Explanation("", "", float(np.nan_to_num(error)), base)
+    later = int(np.searchsorted(base.time, base.time[0] + MEMORY_S))
+    if base.error_from(later) < REPAIRED_SHARE * AGREES_RAD:
+        text = f"after {MEMORY_S} s they agree within {base.error_from(later):.4f} rad"
+        return Explanation("memory_kept", text, error, base)
+    factor, left = _action_factor(replay)
+    found = [("action_scale", f"with {factor:.2f} times the action scale by {left:.4f} rad", left / error)]
+    short = replay.run(Variant("short"), SEARCH_TICKS).error
+    for cause, variants in _variants(replay):
+        best, after = replay.best(variants, SEARCH_TICKS)
+        found.append((cause, f"with {best.name} by {after:.4f} rad", after / short))
+    term, scale, left = _refined_scale(replay)
+    found.append(
+        ("observation_scale", f"with {scale:.3g} times the scale of {term} by {left:.4f} rad", left / short)
+    )
+    cause, text, share = min(found, key=lambda entry: entry[2])
+    if share > REPAIRED_SHARE:
+        return Explanation("other_actions", f"closest is {cause}: {text}", error, base)
+    return Explanation(cause, text, error, base)
+
+
+def _action_factor(replay: PolicyReplay) -> tuple[float, float]:
+    """Factor of the actions that fits best, and the difference that it leaves, rad."""
+    base, offset = replay.base, np.array(replay.policy.metadata.action_offset)
+    x, y = (base.expected - offset)[base.valid], (base.recorded - offset)[base.valid]
+    factor = float(x @ y / (x @ x))
+    return factor, float(np.sqrt(np.mean((y - factor * x) ** 2)))
+
+
+def _variants(replay: PolicyReplay) -> Iterator[tuple[str, Sequence[Variant]]]:
+    layout = replay.policy.metadata.observation
+    resets = [Variant(f"the memory cleared every {n} ticks", reset_every=n) for n in RESET_TICKS]
+    yield "memory_reset", resets
+    yield "stale_observation", [Variant(f"states that are {n} ticks older", late=n) for n in LATE_TICKS]
+    orders = [Variant(name, observe=change) for name, change in _reorderings(layout)]
+    yield "observation_order", orders
+
+
+def _reorderings(layout: InputLayout) -> Iterator[tuple[str, Observe]]:
+    """Other orders of an observation: joints reordered, and terms of one size exchanged."""
+    twelve = [term.name for term in layout.terms if term.size == 12]
+    for name, order in REORDERINGS.items():
+        for terms in (("q", "dq"), tuple(twelve)):
+            yield f"{', '.join(terms)} with {name}", _reordered(terms, order)
+    for k, first in enumerate(layout.terms):
+        for second in layout.terms[k + 1 :]:
+            if first.size == second.size:
+                yield f"{first.name} and {second.name} exchanged", _exchanged(first.name, second.name)
+    yield "roll and pitch exchanged", _reordered(("roll_pitch",), (1, 0))
+
+
+def _reordered(terms: Sequence[str], order: Sequence[int]) -> Observe:
+    def change(x: NDArray[np.float32], layout: InputLayout) -> NDArray[np.float32]:
+        for name in terms:
+            place = term_slice(layout, name)
+            x[place] = x[place][list(order)]
+        return x
+
+    return change
+
+
+def _exchanged(first: str, second: str) -> Observe:
+    def change(x: NDArray[np.float32], layout: InputLayout) -> NDArray[np.float32]:
+        a, b = term_slice(layout, first), term_slice(layout, second)
+        x[a], x[b] = x[b].copy(), x[a].copy()
+        return x
+
+    return change
+
+
+def _scaled(name: str, factor: float) -> Observe:
+    def change(x: NDArray[np.float32], layout: InputLayout) -> NDArray[np.float32]:
+        x[term_slice(layout, name)] *= factor
+        return x
+
+    return change
+
+
+def _refined_scale(replay: PolicyReplay) -> tuple[str, float, float]:
+    """Term and factor of its scale that fit best, and the difference that they leave, rad."""
+    layout = replay.policy.metadata.observation
+
+    def left(name: str, factor: float) -> float:
+        return replay.run(Variant("", observe=_scaled(name, factor)), SEARCH_TICKS).error
+
+    error, term, scale = min((left(name, factor), name, factor) for name in layout.names for factor in SCALES)
+    return term, *_golden(lambda factor: left(term, factor), scale, error)
+
+
+def _golden(error: Callable[[float], float], scale: float, before: float) -> tuple[float, float]:
+    """Refine a factor by halving the step around it; (factor, error)."""
+    step = 0.2 * abs(scale)
+    for _ in range(5):
+        tried = [(error(scale + side * step), scale + side * step) for side in (-1.0, 1.0)]
+        best, where = min(tried)
+        if best < before:
+            before, scale = best, where
+        step *= 0.5
+    return scale, before

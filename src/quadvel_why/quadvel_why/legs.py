@@ -1,0 +1,150 @@
+"""What the legs say about trunk and ground: forces from torques, velocities and heights of planted feet.
+
+Needs the kinematics of the robot. With p and J of each foot in the trunk frame, R the orientation and w the gyroscope,
+
+    f = -J^-T tau               force of the ground on a foot, massless legs
+    v = v_roll - (w x p + J dq) velocity of the trunk if the foot does not slip
+    z = (R p)_z                 height of the foot relative to the trunk
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from quadvel_description.arrays import Array, Bools
+from quadvel_description.kinematics import foot_kinematics, rotation_matrix
+from quadvel_description.state import RobotState
+from quadvel_estimator.odometry import leg_velocity
+
+from .run import Run
+
+PLANTED_N = 40.0
+"""A foot that pushes with more stands."""
+MIN_PUSH_N = 10.0
+BALANCE_WINDOW_S, MIN_BALANCE_ROWS = 0.05, 60
+DAMPING_M2 = 1e-4
+"""Of the least squares of the forces, near a straight leg."""
+PAIRS = tuple(combinations(range(4), 2))
+
+
+class Legs:
+    """Forces, velocities and heights of the feet of a run; angles may be corrected first.
+
+    Attributes:
+        usable: States that count, (n,): the robot walks, or stands too.
+    """
+
+    def __init__(
+        self, run: Run, joints: tuple[Array, Array, Array] | None = None, walking_only: bool = False
+    ) -> None:
+        """Compute what the recorded (or corrected) joints say.
+
+        Args:
+            run: The run, of the own robot, with IMU and torques.
+            joints: Angles, speeds and torques instead of the recorded ones, (n, 12) each.
+            walking_only: Whether only walking counts, not standing.
+        """
+        assert run.imu is not None
+        assert run.tau is not None
+        self.run = run
+        self._q, self._dq, self._tau = joints or (run.q, run.dq, run.tau)
+        self.rotation = rotation_matrix(run.imu.quaternion)
+        self.feet, self._jacobians = foot_kinematics(self._q)
+        finite = np.isfinite(self._q).all(axis=1) & np.isfinite(run.imu.quaternion).all(axis=1)
+        self.usable = (run.walking if walking_only else run.on_feet) & finite
+
+    def _to_world(self, vectors: Array) -> Array:
+        return np.asarray(vectors @ self.rotation.swapaxes(-1, -2))
+
+    @cached_property
+    def force(self) -> Array:
+        """Force of the ground on each foot, world frame, (n, 4, 3), N."""
+        torque = self._tau.reshape(-1, 4, 3, 1)
+        transposed = self._jacobians.swapaxes(-1, -2)
+        # Damped least squares of J^T f = -tau: f = -(J J^T + lambda)^-1 J tau.
+        damped = self._jacobians @ transposed + DAMPING_M2 * np.eye(3)
+        return self._to_world(-np.linalg.solve(damped, self._jacobians @ torque)[..., 0])
+
+    @cached_property
+    def planted(self) -> Bools:
+        """Whether each foot stands, (n, 4)."""
+        return np.asarray((self.force[..., 2] > PLANTED_N) & self.usable[:, None])
+
+    @cached_property
+    def velocity(self) -> Array:
+        """Velocity of the trunk from each leg, world frame, (n, 4, 3), m/s."""
+        run = self.run
+        assert run.imu is not None
+        state = RobotState(
+            0.0,
+            0,
+            self._q,
+            self._dq,
+            self._tau,
+            run.imu.quaternion,
+            run.imu.angular_velocity,
+            run.imu.linear_acceleration,
+            np.zeros(4),
+        )
+        return self._to_world(leg_velocity(state))
+
+    @cached_property
+    def height(self) -> Array:
+        """Height of each foot relative to the trunk, (n, 4), m."""
+        return np.asarray(self._to_world(self.feet)[..., 2])
+
+    def pair_rows(self) -> list[tuple[int, int, Bools]]:
+        """Return the pairs of feet with the states in which both stand.
+
+        Returns:
+            Two legs and a mask (n,) each.
+        """
+        return [(i, j, self.planted[:, i] & self.planted[:, j]) for i, j in PAIRS]
+
+    @cached_property
+    def disagreement(self) -> float:
+        """Median difference of the trunk's velocity between two planted legs, m/s."""
+        found = [
+            np.linalg.norm((self.velocity[:, i] - self.velocity[:, j])[rows], axis=-1)
+            for i, j, rows in self.pair_rows()
+        ]
+        values = np.concatenate(found)
+        return float(np.median(values)) if len(values) else float("inf")
+
+    @cached_property
+    def unevenness(self) -> float:
+        """Robust standard deviation of the height between two planted feet, m."""
+        found = [(self.height[:, i] - self.height[:, j])[rows] for i, j, rows in self.pair_rows()]
+        values = np.concatenate(found)
+        return float(1.4826 * np.median(np.abs(values))) if len(values) else float("inf")
+
+    @cached_property
+    def trunk_velocity(self) -> Array:
+        """Velocity of the trunk from the planted feet, body frame, (n, 3), m/s; NaN without one.
+
+        The component-wise median of the planted legs.
+        """
+        legs = np.where(self.planted[..., None], self.velocity, np.nan)
+        some = self.planted.any(axis=1)
+        found = np.full((len(self.planted), 3), np.nan)
+        found[some] = np.nanmedian(legs[some], axis=1)
+        return np.asarray((found[:, None] @ self.rotation)[:, 0])
+
+    @cached_property
+    def roll_balance(self) -> float:
+        """Correlation of the roll moment of the feet with the change of the roll rate; negative if sides are exchanged.
+
+        I dw/dt = sum p x f: on a sound robot both have the same sign.
+        """
+        assert self.run.imu is not None
+        half = max(1, round(0.5 * BALANCE_WINDOW_S / self.run.period))
+        rate = self.run.imu.angular_velocity[:, 0]
+        pushes = np.where(self.force[..., 2:] > MIN_PUSH_N, self.force @ self.rotation, 0.0)
+        moment = np.cross(self.feet, pushes).sum(axis=1)[:, 0]
+        total = np.concatenate([[0.0], np.cumsum(moment)])
+        change, mean = rate[2 * half :] - rate[: -2 * half], (total[2 * half : -1] - total[: -2 * half - 1])
+        use = self.usable[2 * half :] & self.usable[: -2 * half]
+        return float(np.corrcoef(change[use], mean[use])[0, 1]) if use.sum() > MIN_BALANCE_ROWS else 0.0

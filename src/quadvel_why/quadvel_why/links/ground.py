@@ -1,0 +1,152 @@
+"""Ground and load: do the feet hold, and are slope, roughness and mass those of the training?"""
+
+from __future__ import annotations
+
+import numpy as np
+from typing_extensions import override
+
+from quadvel_description.arrays import Array
+from quadvel_description.robot import GRAVITY, MASS
+
+from ..cause import Cause, Link, Measurement, Trace, worst_span
+from ..legs import Legs
+from ..signals import Signals
+
+LOADED_N = 60.0
+"""A foot that pushes with more cannot be in the act of landing or leaving."""
+MIN_ROWS = 60
+MIN_WEIGHING_S = 1.0
+"""Shorter means of the force are not the weight."""
+WALKED_SLOPE_RAD = 0.29
+"""Steepest ground on which the shipped policy was shown to walk, 15 degrees, and a margin for its measurement."""
+FOUND_MASS_SHARE = 0.946
+"""Share of the mass that massless legs show in the torques, on the mean of healthy walks."""
+MASS_MARGIN_KG = 0.8
+
+
+def _loaded(legs: Legs) -> Array:
+    return np.asarray(legs.planted & (legs.force[..., 2] > LOADED_N))
+
+
+class Slipping(Cause):
+    """Loaded feet slide: the velocity that they show is not that of the trunk."""
+
+    link = Link.GROUND
+    unit = "m/s"
+    least = 0.1
+    needs = ("torque", "imu", "robot", "estimate")
+    remedy = "Walk slower on this ground, with softer feet, or train with less friction"
+
+    @override
+    def measure(self, signals: Signals) -> Measurement | None:
+        run, legs = signals.run, signals.legs
+        assert run.estimate is not None
+        loaded = _loaded(legs)
+        if loaded.sum() < MIN_ROWS:
+            return None
+        estimate = np.column_stack(
+            [np.interp(run.time, run.estimate.time, axis) for axis in run.estimate.value.T]
+        )
+        world = (estimate[:, None] @ legs.rotation.swapaxes(-1, -2))[:, 0]
+        slip = np.linalg.norm((legs.velocity - world[:, None])[..., :2], axis=-1)
+        value = float(np.percentile(slip[loaded], 75))
+        force = legs.force[loaded]
+        ratio = np.linalg.norm(force[:, :2], axis=1) / force[:, 2]
+        per_state = np.where(loaded, slip, 0.0).max(axis=1)
+        trace = Trace("slip of the fastest loaded foot, m/s", run.time, per_state, np.zeros(len(run.time)))
+        sentence = (
+            f"a quarter of the time loaded feet slide faster than {value:.2f} m/s; tangential force over normal force "
+            f"{np.median(ratio):.2f} on the median"
+        )
+        return Measurement(value, sentence, worst_span(run.time, per_state), (trace,))
+
+
+def _plane(legs: Legs) -> tuple[Array, Array, Array, Array]:
+    """Slope (2,), heights, heights on that slope and times of pairs of planted feet, by least squares."""
+    world = np.asarray(legs.feet @ legs.rotation.swapaxes(-1, -2))
+    heights, apart, times = [], [], []
+    for i, k, rows in legs.pair_rows():
+        heights.append((legs.height[:, i] - legs.height[:, k])[rows])
+        apart.append((world[:, i, :2] - world[:, k, :2])[rows])
+        times.append(legs.run.time[rows])
+    z, d, time = np.concatenate(heights), np.concatenate(apart), np.concatenate(times)
+    order = np.argsort(time, kind="stable")
+    z, d, time = z[order], d[order], time[order]
+    slope = np.linalg.solve(d.T @ d + 1e-3 * np.eye(2), d.T @ z)
+    return slope, z, np.asarray(d @ slope), time
+
+
+class SteepGround(Cause):
+    """The ground is steeper than where the policy was shown to walk."""
+
+    link = Link.GROUND
+    unit = "rad"
+    least = 0.0
+    needs = ("torque", "imu", "robot")
+    remedy = "Take another way, or train on steeper ground (`terrain` of the recipe)"
+
+    @override
+    def measure(self, signals: Signals) -> Measurement | None:
+        legs = signals.legs
+        if sum(int(rows.sum()) for _, _, rows in legs.pair_rows()) < MIN_ROWS:
+            return None
+        slope, heights, on_slope, time = _plane(legs)
+        angle = float(np.arctan(np.linalg.norm(slope)))
+        trace = Trace("height between planted feet and on that slope, m", time, heights, on_slope)
+        sentence = f"planted feet lie on a slope of {np.rad2deg(angle):.0f} degrees"
+        return Measurement(
+            angle, sentence, worst_span(time, np.abs(heights)), (trace,), limit=WALKED_SLOPE_RAD
+        )
+
+
+class RoughGround(Cause):
+    """The ground is rougher than in the training: planted feet lie further off one plane."""
+
+    link = Link.GROUND
+    unit = "m"
+    least = 0.02
+    needs = ("torque", "imu", "robot")
+    remedy = "Take another way, or train on rougher ground (`terrain` of the recipe)"
+
+    @override
+    def measure(self, signals: Signals) -> Measurement | None:
+        legs = signals.legs
+        if sum(int(rows.sum()) for _, _, rows in legs.pair_rows()) < MIN_ROWS:
+            return None
+        _, heights, on_slope, time = _plane(legs)
+        off = heights - on_slope
+        value = float(np.percentile(np.abs(off), 80))
+        trace = Trace("height between planted feet and on their mean slope, m", time, heights, on_slope)
+        sentence = (
+            f"one in five pairs of planted feet lies more than {100 * value:.1f} cm off their mean slope"
+        )
+        return Measurement(value, sentence, worst_span(time, np.abs(off)), (trace,))
+
+
+class Payload(Cause):
+    """The robot is heavier or lighter than in the training: the forces of the feet carry another mass."""
+
+    link = Link.GROUND
+    unit = "kg"
+    least = 0.0
+    needs = ("torque", "imu", "robot")
+    remedy = "Take load off, or train with it (`payload` of the recipe)"
+
+    @override
+    def measure(self, signals: Signals) -> Measurement | None:
+        legs = signals.legs
+        rows = legs.usable & signals.run.walking
+        if rows.sum() * signals.run.period < MIN_WEIGHING_S:
+            return None
+        total = legs.force[..., 2].sum(axis=1)
+        mass = float(total[rows].mean()) / GRAVITY / FOUND_MASS_SHARE - MASS
+        low, high = signals.trained.payload
+        beyond = max(mass - high, low - mass, 0.0)
+        expected = np.full(len(total), MASS * GRAVITY * FOUND_MASS_SHARE)
+        trace = Trace("force of all feet and of the robot's weight, N", signals.run.time, total, expected)
+        sentence = (
+            f"the feet carry {mass:+.1f} kg more than the robot, trained from {low:+.0f} to {high:+.0f} kg"
+        )
+        torque = "torques that are reported too large look the same: weigh the robot"
+        span = worst_span(signals.run.time, np.where(rows, np.abs(total - expected), 0.0))
+        return Measurement(beyond, f"{sentence} ({torque})", span, (trace,), limit=MASS_MARGIN_KG)

@@ -1,0 +1,287 @@
+"""Replays the policy on what was recorded: are the recorded commands its actions, and if not, what would make them?
+
+The observation is built by the controller's own function. A `Variant` is a hypothesis about what the controller did
+differently; the right one reproduces the commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from quadvel_description.arrays import Array, Bools, Indices
+from quadvel_description.network_input import InputLayout
+from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
+from quadvel_policy.command_limits import JointCommandLimits
+from quadvel_policy.config import SupervisorConfig
+from quadvel_policy.observation import JOINTS, build_observation
+from quadvel_policy.policy_file import PolicyFile
+from quadvel_policy.supervisor import MIN_STEPPING_SPEED, STANCE_COMMAND
+
+from .run import SAME_INSTANT_S, Run
+
+Observe = Callable[[NDArray[np.float32], InputLayout], NDArray[np.float32]]
+"""Changes a finished observation."""
+MAX_FEED_FORWARD_NM = 1e-3
+"""Torques beside the target mean that the limits of joint commands acted: the target says no action then.
+
+So do torques near a limit.
+"""
+NEAR_LIMIT = 0.98
+BEFORE_FAULT_S = 0.25
+"""Before a fault, guards may already replace velocity and command."""
+MIN_TICKS = 20
+MODE_REPORT_PERIOD_S = 0.05
+"""Longest time from the start of a walk to the first report of it."""
+
+
+def term_slice(layout: InputLayout, name: str) -> slice:
+    """Return the place of a term in an observation.
+
+    Args:
+        layout: The observation.
+        name: Name of the term.
+
+    Returns:
+        Its slice.
+    """
+    sizes = [term.size for term in layout.terms]
+    k = layout.names.index(name)
+    return slice(sum(sizes[:k]), sum(sizes[: k + 1]))
+
+
+@attrs.frozen
+class Variant:
+    """A hypothesis about what the controller did.
+
+    Attributes:
+        name: What it did, for people.
+        observe: Change of the observation; None: none.
+        reset_every: Ticks after which it cleared the memory; 0: never.
+        late: Ticks by which the states that it used were older.
+    """
+
+    name: str
+    observe: Observe | None = None
+    reset_every: int = 0
+    late: int = 0
+
+
+@attrs.frozen(eq=False)
+class Replay:
+    """A replay of k ticks.
+
+    Attributes:
+        time: Times of the states, (k,), s.
+        expected: Targets of the policy, (k, 12), rad.
+        recorded: Recorded targets, (k, 12), rad.
+        valid: Targets that no limit changed, (k, 12).
+    """
+
+    time: Array
+    expected: Array
+    recorded: Array
+    valid: Bools
+
+    @cached_property
+    def error(self) -> float:
+        """Root mean square of recorded minus expected targets, rad."""
+        return self.error_from(0)
+
+    def error_from(self, first: int) -> float:
+        """Return the error from a tick on.
+
+        Args:
+            first: First tick.
+
+        Returns:
+            Root mean square, rad; NaN without valid ticks.
+        """
+        valid = self.valid[first:]
+        if valid.sum() < MIN_TICKS:
+            return float("nan")
+        return float(np.sqrt(np.mean((self.recorded[first:] - self.expected[first:])[valid] ** 2)))
+
+
+class PolicyReplay:
+    """Replays of one policy on one run of this stack.
+
+    Attributes:
+        policy: The policy.
+        ticks: Rows of the commands that the policy gave, (k,), of the longest walk.
+    """
+
+    def __init__(self, run: Run, policy: PolicyFile) -> None:
+        self._run, self.policy = run, policy
+        self.ticks = self._policy_ticks()
+        self._prepared: dict[int, NDArray[np.float32]] = {}
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether there is a walk with a velocity estimate to replay."""
+        return len(self.ticks) >= MIN_TICKS and self._run.estimate is not None and self._run.imu is not None
+
+    def _policy_ticks(self) -> Indices:
+        """Commands of the first walk that are no repetitions of the one before."""
+        run, commands = self._run, self._run.commands
+        if run.modes is None or run.imu is None:
+            return np.zeros(0, int)
+        with_gains = np.isclose(commands.kp, np.array(self.policy.metadata.kp)).all(axis=1) & commands.servo
+        # The mode is reported less often than commands leave: the fade-in changes kp from tick to tick.
+        fading = np.zeros(len(commands.time), bool)
+        fading[1:] = (np.abs(np.diff(commands.kp, axis=0)) > 1e-6).any(axis=1) & commands.servo[1:]
+        walk = next(
+            (t for t, name in zip(run.modes.time, run.modes.name, strict=True) if name == "walk"), np.inf
+        )
+        starts = np.flatnonzero(fading & (commands.time > walk - MODE_REPORT_PERIOD_S))
+        if not starts.size:
+            return np.zeros(0, int)
+        first = int(starts[0]) - 1  # the first tick of a walk repeats the command before it
+        stop = first + 1
+        while stop < len(commands.time) and (with_gains[stop] or fading[stop]):
+            stop += 1
+        rows = np.arange(first, stop)
+        changed = (np.diff(commands.target[rows], axis=0, prepend=np.nan) != 0.0).any(axis=1)
+        return rows[changed]
+
+    @cached_property
+    def _velocity_rows(self) -> Indices:
+        """Estimate in use at each tick: the one of the state before."""
+        assert self._run.estimate is not None
+        answered = self._run.time[self._run.commands.answers[self.ticks]]
+        rows = np.searchsorted(self._run.estimate.time, answered - SAME_INSTANT_S, side="left") - 1
+        return np.maximum(rows, 0)
+
+    @cached_property
+    def _velocity_commands(self) -> Array:
+        """vx, vy, wz and stance in effect at each tick, (k, 4)."""
+        run = self._run
+        answered = run.time[run.commands.answers[self.ticks]]
+        if run.velocity_command is None:
+            if run.effective_command is None:
+                return np.tile(STANCE_COMMAND, (len(self.ticks), 1))
+            return run.effective_command.latest_at(answered + SAME_INSTANT_S)
+        asked = run.velocity_command.latest_at(answered + SAME_INSTANT_S)
+        limits = self.policy.metadata.limits
+        stands = (asked[:, 3] >= 0.5) | self._made_to_stand(answered)
+        return np.array(
+            [
+                STANCE_COMMAND if still else [*limits.clamp(row[:3]), 0.0]
+                for row, still in zip(asked, stands, strict=True)
+            ]
+        )
+
+    def _made_to_stand(self, times: Array) -> Bools:
+        """Whether the controller reported before and after each time that it stands, whatever was commanded."""
+        reports = self._run.effective_command
+        if reports is None:
+            return np.zeros(len(times), bool)
+        before = np.searchsorted(reports.time, times + SAME_INSTANT_S, side="right") - 1
+        after = np.minimum(before + 1, len(reports.time) - 1)
+        stands = reports.value[:, 3] >= 0.5
+        return np.asarray(stands[np.maximum(before, 0)] & stands[after])
+
+    @cached_property
+    def base(self) -> Replay:
+        """The replay of the policy as its file says."""
+        return self.run(Variant("as the file says"))
+
+    @cached_property
+    def _fault_time(self) -> float:
+        """Time of the first reported fault, s; infinity without one."""
+        modes = self._run.modes
+        assert modes is not None
+        return next(
+            (float(t) for t, fault in zip(modes.time, modes.fault, strict=True) if fault), float("inf")
+        )
+
+    @cached_property
+    def _limited(self) -> Bools:
+        """Targets that the limits of joint commands may have changed, (k, 12)."""
+        run, commands, ticks = self._run, self._run.commands, self.ticks
+        rows, limits = commands.answers[ticks], JointCommandLimits()
+
+        def torque(command: Indices) -> Array:
+            asked = commands.kp[command] * (commands.target[command] - run.q[rows])
+            return np.asarray(asked - commands.kd[command] * run.dq[rows])
+
+        now, before = torque(ticks), torque(np.maximum(ticks - 1, 0))
+        power = np.maximum(now * run.dq[rows], 0.0).sum(axis=1, keepdims=True)
+        return np.asarray(
+            (np.abs(commands.tau[ticks]) > MAX_FEED_FORWARD_NM)
+            | (np.abs(now) > NEAR_LIMIT * TORQUE_LIMIT)
+            | (np.abs(now - before) > NEAR_LIMIT * limits.max_torque_step)
+            | (np.abs(run.dq[rows]) > NEAR_LIMIT * VELOCITY_LIMIT)
+            | (power > NEAR_LIMIT * limits.max_power)
+        )
+
+    def _observations(self, late: int) -> NDArray[np.float32]:
+        """Observations of all ticks without the previous actions, (k, 48)."""
+        run = self._run
+        assert run.imu is not None
+        assert run.estimate is not None
+        rows = np.maximum(run.commands.answers[self.ticks] - late, 0)
+        velocity = run.estimate.value[self._velocity_rows]
+        command = self._velocity_commands.copy()
+        command[np.hypot(velocity[:, 0], velocity[:, 1]) > MIN_STEPPING_SPEED, 3] = 0.0
+        return build_observation(
+            self.policy.metadata.observation,
+            command=command,
+            quaternion=run.imu.quaternion[rows],
+            q=run.q[rows],
+            dq=run.dq[rows],
+            linear_velocity=velocity,
+            angular_velocity=run.imu.angular_velocity[rows],
+            previous_action=np.zeros((len(rows), JOINTS)),
+        )
+
+    def run(self, variant: Variant, most: int | None = None) -> Replay:
+        """Replay the walk: the observations of the recording with the actions of the replay.
+
+        Args:
+            variant: The hypothesis.
+            most: Largest number of ticks; None: the whole walk.
+
+        Returns:
+            The replay.
+        """
+        meta, ticks = self.policy.metadata, self.ticks[:most]
+        if variant.late not in self._prepared:
+            self._prepared[variant.late] = self._observations(variant.late)
+        observations = self._prepared[variant.late]
+        term = next(term for term in meta.observation.terms if term.name == "previous_action")
+        own = term_slice(meta.observation, term.name)
+        bound = np.inf if term.clip is None else term.clip
+        action, actions = np.zeros(JOINTS, np.float32), np.empty((len(ticks), JOINTS), np.float32)
+        self.policy.reset()
+        for k in range(len(ticks)):
+            observation = observations[k].copy()
+            observation[own] = np.clip((action - term.offset) * term.scale, -bound, bound)
+            if variant.observe is not None:
+                observation = variant.observe(observation, meta.observation)
+            if variant.reset_every and k % variant.reset_every == 0:
+                self.policy.reset()
+            action = actions[k] = self.policy.step(observation)
+        commands, time = self._run.commands, self._run.time[self._run.commands.answers[ticks]]
+        faded = time - time[0] >= SupervisorConfig().blend_time
+        sound = time < self._fault_time - BEFORE_FAULT_S
+        valid = ~self._limited[: len(ticks)] & (faded & sound)[:, None]
+        return Replay(time, meta.action.targets(actions), commands.target[ticks], valid)
+
+    def best(self, variants: Sequence[Variant], most: int) -> tuple[Variant, float]:
+        """Return the variant that reproduces the commands best.
+
+        Args:
+            variants: The hypotheses.
+            most: Number of ticks that decide.
+
+        Returns:
+            The variant and its error, rad.
+        """
+        errors = [self.run(variant, most).error for variant in variants]
+        k = int(np.nanargmin(errors))
+        return variants[k], errors[k]

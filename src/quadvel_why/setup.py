@@ -1,0 +1,5 @@
+"""Build script; setup.cfg has the settings."""
+
+from setuptools import setup
+
+setup()

@@ -1,0 +1,141 @@
+"""The diagnosis names what was changed in a recorded walk, and nothing in a sound one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import attrs
+import numpy as np
+import pytest
+
+from quadvel_bringup import cli
+from quadvel_policy.policy_file import PolicyFile
+from quadvel_why.diagnosis import Diagnosis, diagnose
+from quadvel_why.links import CAUSES
+from quadvel_why.page import page
+from quadvel_why.reading import read_run
+from quadvel_why.run import Commands, Run
+from quadvel_why.signals import PARTS, Signals
+
+ORDER = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
+
+
+@pytest.fixture(scope="module")
+def run(walk: Path) -> Run:
+    return read_run(walk)
+
+
+def examine(run: Run) -> Diagnosis:
+    return diagnose(Signals(run, PolicyFile()))
+
+
+def commands(run: Run, **fields: object) -> Run:
+    return attrs.evolve(run, commands=attrs.evolve(run.commands, **fields))
+
+
+def imu(run: Run, **fields: object) -> Run:
+    assert run.imu is not None
+    return attrs.evolve(run, imu=attrs.evolve(run.imu, **fields))
+
+
+def scaled_targets(c: Commands) -> np.ndarray:
+    offset = np.array(PolicyFile().metadata.action_offset)
+    walks = np.isclose(c.kp, 30.0)
+    return np.where(walks, offset + 0.6 * (c.q - offset), c.q)
+
+
+def flipped(values: np.ndarray, joint: int) -> np.ndarray:
+    changed = values.copy()
+    changed[:, joint] *= -1.0
+    return changed
+
+
+def held(values: np.ndarray, joint: int) -> np.ndarray:
+    changed = values.copy()
+    changed[200:206, joint] = changed[200, joint]
+    return changed
+
+
+def repeated(run: Run) -> Run:
+    rows = np.arange(len(run.time))
+    rows[100::10] -= 1
+    return attrs.evolve(run, q=run.q[rows], dq=run.dq[rows])
+
+
+CHANGES: dict[str, Callable[[Run], Run]] = {
+    "joint_order": lambda r: attrs.evolve(r, **{f: getattr(r, f)[:, ORDER] for f in ("q", "dq", "tau")}),
+    "joint_sign": lambda r: attrs.evolve(r, q=flipped(r.q, 4), dq=flipped(r.dq, 4), tau=flipped(r.tau, 4)),
+    "joint_scale": lambda r: attrs.evolve(r, dq=np.rad2deg(r.dq)),
+    "joint_offset": lambda r: attrs.evolve(r, q=r.q + 0.1 * (np.arange(12) == 7)),
+    "gains": lambda r: commands(r, kp=1.3 * r.commands.kp, kd=1.3 * r.commands.kd),
+    "quaternion_order": lambda r: imu(r, quaternion=r.imu.quaternion[:, [1, 2, 3, 0]]),  # type: ignore[union-attr]
+    "gyro_frame": lambda r: imu(r, angular_velocity=-r.imu.angular_velocity),  # type: ignore[union-attr]
+    "repeated_states": repeated,
+    "long_delay": lambda r: commands(r, time=r.commands.time - 0.011),
+    "encoder_held": lambda r: attrs.evolve(r, q=held(r.q, 5), dq=held(r.dq, 5)),
+    "weak_drive": lambda r: attrs.evolve(r, tau=r.tau * np.where(np.arange(12) == 3, 0.4, 1.0)),
+    "command_out_of_range": lambda r: attrs.evolve(
+        r,
+        velocity_command=attrs.evolve(r.velocity_command, value=8.0 * r.velocity_command.value),  # type: ignore[union-attr]
+    ),
+}
+"""Name of a cause, and a change of a sound recording that has this cause"""
+
+
+def test_a_sound_walk_has_no_finding(run: Run) -> None:
+    found = examine(run)
+    assert found.finding is None, found.finding
+    assert not found.skipped
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_changed_recording_is_named_by_what_was_changed(name: str, run: Run) -> None:
+    if name in ("command_out_of_range", "quaternion_order", "gyro_frame", "repeated_states", "joint_offset"):
+        # Other links than the actions are meant: without the estimate no policy is replayed.
+        run = attrs.evolve(run, estimate=None)
+    found = examine(CHANGES[name](run)).finding
+    assert found is not None
+    assert found.cause.name() == name, found.measurement.sentence
+    assert found.measurement.value > found.limit
+    assert found.measurement.traces
+
+
+def test_another_scale_of_the_actions_is_named(run: Run) -> None:
+    changed = attrs.evolve(commands(run, q=scaled_targets(run.commands)), tau=None)
+    found = examine(changed).finding
+    assert found is not None
+    assert found.cause.name() == "action_scale", found.measurement.sentence
+    assert "0.60 times" in found.measurement.sentence
+
+
+def test_what_a_recording_lacks_is_told_and_not_guessed(run: Run) -> None:
+    joints_only = attrs.evolve(run, imu=None, estimate=None, modes=None, velocity_command=None, is_own=False)
+    found = diagnose(Signals(joints_only, None))
+    assert found.finding is None
+    assert {"quaternion_order", "slipping", "memory_reset"} <= found.skipped.keys()
+
+
+def test_the_command_writes_the_finding_and_ends_with_1(run: Run, tmp_path: Path) -> None:
+    rows = np.flatnonzero(run.commands.servo[np.maximum(run.command_rows(0.0), 0)])
+    log = {"t": run.time[rows], "q": run.q[rows], "dq": run.dq[rows], "tau": -run.tau[rows]}  # type: ignore[index]
+    now = np.maximum(run.command_rows(0.0), 0)[rows]
+    log |= {"q_des": run.commands.q[now], "kp": run.commands.kp[now], "kd": run.commands.kd[now]}
+    np.savez(tmp_path / "log.npz", **log)
+    with pytest.raises(SystemExit) as ended:
+        cli.command("why").main([str(tmp_path / "log.npz"), "--out", str(tmp_path / "out")])
+    assert ended.value.code == 1
+    assert json.loads((tmp_path / "out" / "why.json").read_text())["finding"]["cause"]
+    assert (tmp_path / "out" / "why.png").stat().st_size > 1000
+
+
+def test_every_cause_has_a_row_and_knows_what_it_needs() -> None:
+    names = [cause.name() for cause in CAUSES]
+    assert len(set(names)) == len(names) >= 24
+    assert all(set(cause.needs) <= PARTS.keys() and cause.remedy for cause in CAUSES)
+
+
+def test_the_page_is_as_printed() -> None:
+    printed = Path(__file__).parents[2] / "docs" / "why.md"
+    assert printed.read_text() == page(), "run: python -m quadvel_why.page > docs/why.md"
