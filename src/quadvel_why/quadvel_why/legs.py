@@ -89,7 +89,7 @@ class Legs:
             run.imu.linear_acceleration,
             np.zeros(4),
         )
-        return self._to_world(leg_velocity(state))
+        return self._to_world(leg_velocity(state, self.rotation))
 
     @cached_property
     def height(self) -> Array:
