@@ -51,7 +51,7 @@ def _process_pool() -> Iterator[Callable[..., Any]]:
                 worker.terminate()
             raise
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(cancel_futures=True)  # waits: else Python itself may use a closed pipe at its exit
 
 
 @contextmanager
