@@ -139,3 +139,11 @@ def test_every_cause_has_a_row_and_knows_what_it_needs() -> None:
 def test_the_page_is_as_printed() -> None:
     printed = Path(__file__).parents[2] / "docs" / "why.md"
     assert printed.read_text() == page(), "run: python -m quadvel_why.page > docs/why.md"
+
+
+def test_lost_states_are_no_jump_of_the_angle(run: Run) -> None:
+    kept = np.setdiff1d(np.arange(len(run.time)), [200, 201, 202, 300])
+    lost = attrs.evolve(run, time=run.time[kept], q=run.q[kept], dq=run.dq[kept])
+    whole, jumps = Signals(run, None).jumps, Signals(lost, None).jumps
+    assert not jumps[[199, 296]].any()
+    assert np.abs(jumps).max() <= np.abs(whole).max()

@@ -22,6 +22,8 @@ from .policy_replay import PolicyReplay
 from .run import Run
 from .torque import TorqueModel
 
+GAP_PERIODS = 1.5  # states further apart than this have lost states between them
+
 PARTS: Mapping[str, str] = {
     "drives": "reported joint torques and servo commands",
     "torque": "reported joint torques while the drives follow targets",
@@ -150,10 +152,14 @@ class Signals:
 
     @cached_property
     def jumps(self) -> Array:
-        """Change of each angle that its speeds do not explain, (n - 1, J), rad."""
+        """Change of each angle that its speeds do not explain, (n - 1, J), rad; 0 across lost states."""
         run = self.run
         dt = np.diff(run.time)[:, None]
-        return np.asarray(np.diff(run.q, axis=0) - 0.5 * dt * (run.dq[1:] + run.dq[:-1]))
+        # dq_mean = (dq[i] + dq[i+1]) / 2 says little of a gap, in which the speed may turn round
+        unexplained = np.diff(run.q, axis=0) - 0.5 * dt * (run.dq[1:] + run.dq[:-1])
+        return np.asarray(
+            np.where(np.isfinite(unexplained) & (dt > GAP_PERIODS * run.period), 0.0, unexplained)
+        )
 
     @cached_property
     def repeated(self) -> Bools:
