@@ -33,7 +33,7 @@ from .rewards import RewardWeights, Table2
 from .walking_rewards import error_magnitudes
 
 CRITIC_SIZE = (
-    privileged.OBSERVATION_SIZE + privileged.CRITIC_EXTRA_SIZE + 12 + 12
+    privileged.STATE_SIZE + privileged.CRITIC_EXTRA_SIZE + 12 + 12
 )  # the last two: joint torques and exploration noise
 PARTS = ("physics", "sensing", "inference", "learning")  # of the time of an update; sensing includes rewards
 
@@ -259,7 +259,7 @@ class ConstrainedRun:
             (n, CRITIC_SIZE), float32.
         """
         env, past = self.env, self.past
-        known = privileged.observe(env, past, self._action)
+        known = privileged.observe_state(env, past, self._action)
         seen = known, privileged.critic_extra(env, past), 0.05 * env.torque, self._noise
         return np.concatenate(seen, axis=1).astype(np.float32)
 

@@ -61,14 +61,15 @@ MIRROR = symmetry.concatenate_mirrors(
         _signs(1),  # height
         _PLANAR,  # error over a stride
         _PLANAR,  # lasting error
-        _signs(-1, -1),  # clock
         _signs(1, -1),  # slope of the ground
         symmetry.FEET,  # friction
         _signs(1),  # payload
         _signs(1, -1, 1),  # shift of the centre of mass
+        _signs(-1, -1),  # clock
     ]
 )
 OBSERVATION_SIZE = len(MIRROR.index)
+STATE_SIZE = OBSERVATION_SIZE - 2  # without the clock
 CRITIC_EXTRA_SIZE = 4 + 4 + 1
 
 
@@ -159,10 +160,10 @@ def velocity_error(env: VelocityEnv, command: np.ndarray) -> np.ndarray:
     return np.asarray(command[:, :3] - velocity)
 
 
-def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
-    """Observations of the teacher, from the true state.
+def observe_state(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
+    """Observations of the true state, for the critics of all stages.
 
-    They are the paper's 48 numbers, feet, height, past errors, clock, ground and plant.
+    They are the paper's 48 numbers, feet, height, past errors, ground and plant.
 
     Args:
         env: environments.
@@ -170,7 +171,7 @@ def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
         previous: (n, 12), action of the teacher `SAMPLE_S` ago.
 
     Returns:
-        (n, OBSERVATION_SIZE), scaled to about 1.
+        (n, STATE_SIZE), scaled to about 1.
     """
     return np.concatenate(
         [
@@ -186,7 +187,6 @@ def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
             5 * (env.height[:, None] - WALKING_HEIGHT_M),
             2 * past.stride,
             2 * past.lasting,
-            past.clock.observation(env.command),
             3 * env.ground_slope,
             env.plants.drawn[:, :4],
             0.2 * env.plants.drawn[:, 4:5],
@@ -194,6 +194,21 @@ def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
         ],
         axis=1,
     ).astype(np.float32)
+
+
+def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
+    """Observations of the teacher: the true state and the clock.
+
+    Args:
+        env: environments.
+        past: their past.
+        previous: (n, 12), action of the teacher `SAMPLE_S` ago.
+
+    Returns:
+        (n, OBSERVATION_SIZE), scaled to about 1.
+    """
+    clock = past.clock.observation(env.command).astype(np.float32)
+    return np.concatenate([observe_state(env, past, previous), clock], axis=1)
 
 
 def total_action(env: VelocityEnv, past: Past, correction: np.ndarray) -> np.ndarray:
