@@ -1,6 +1,7 @@
 """Takeover of the joints from the robot's own controller, without a fight. No ROS.
 
 What is sent, in this order:
+
 - nothing, until the battery is charged, the motion switcher has released the robot's own controller,
   and nobody has written `rt/lowcmd` or been connected to it for QUIET_S;
 - commands, or damping without them; the switcher is asked again every ASK_PERIOD_S;
