@@ -4,7 +4,7 @@ LowState, LowCmd and the velocity estimate have fixed layouts in CDR, the encodi
 subscription with `raw=True` delivers these bytes, and a publisher accepts them. All other messages
 pass as objects (`messages`).
 
-A number is aligned to its own size, counted from the end of the 4 bytes of encapsulation:
+A number is aligned to its own size, counted from the end of the 4 bytes of encapsulation::
 
     LowState            stamp (s, ns), tick, 50 float32
     LowCmd              stamp (s, ns), tick, mode, 3 bytes, 60 float32
