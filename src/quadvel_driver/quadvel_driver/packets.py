@@ -5,19 +5,37 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable, Mapping
-from typing import Final
+from itertools import accumulate
+from typing import Any, Final, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quadvel_description.arrays import Array
+from quadvel_description.state import JointCommand, RobotState
 
 from .board_state import Button, Remote
+
+JOINTS = 12
+SLOTS = 20  # motors in a packet; quadrupeds use the first twelve
 
 POSITION_OFF, VELOCITY_OFF = 2.146e9, 16000.0  # q and dq that disable the stiffness or damping term
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 LENGTH, CRC, CONTENT = "length", "CRC", "content"
 _BITS_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 _STICKS = ("lx", "ly", "rx", "ry")
+_COMMAND_FIELDS = ("q", "dq", "tau", "kp", "kd")
+_STATE_LENGTHS = {
+    **dict.fromkeys(("q", "dq", "tau"), JOINTS),
+    **{"quaternion": 4, "angular_velocity": 3, "linear_acceleration": 3, "foot_force": 4},
+}
+# Slice of each field in the concatenated numbers.
+_STATE_SLICES = {
+    field: slice(end - length, end)
+    for (field, length), end in zip(_STATE_LENGTHS.items(), accumulate(_STATE_LENGTHS.values()), strict=True)
+}
+Location: TypeAlias = Callable[[str, int], str]
+"""Returns the name of the i-th number of a field: a joint, foot or axis."""
 REMOTE: Final = np.dtype(
     [
         *(("head", "V2"), ("buttons", "<u2"), ("lx", "<f4"), ("rx", "<f4"), ("ry", "<f4")),
@@ -121,7 +139,59 @@ def roll_pitch_yaw(quaternion: Array) -> tuple[float, float, float]:
     )
 
 
-def not_finite(kind: str, numbers: Mapping[str, Array], location: Callable[[str, int], str]) -> WireError:
+def command_numbers(command: JointCommand, location: Location) -> Array:
+    """Return the numbers of a command.
+
+    Args:
+        command: The command.
+        location: Names a number in the error.
+
+    Returns:
+        q, dq, tau, kp and kd, (5, 12).
+
+    Raises:
+        WireError: A number is not finite.
+    """
+    numbers = np.array([getattr(command, field) for field in _COMMAND_FIELDS], float)
+    require_finite_command(numbers, location)
+    return numbers
+
+
+def require_finite_command(numbers: NDArray[np.floating[Any]], location: Location) -> None:
+    """Refuse numbers of a command that are not finite.
+
+    Args:
+        numbers: q, dq and further fields in the order of a command, (1 to 5, 12).
+        location: Names a number in the error.
+
+    Raises:
+        WireError: A number is not finite.
+    """
+    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
+        raise not_finite("command", dict(zip(_COMMAND_FIELDS, numbers, strict=False)), location)
+
+
+def state_numbers(robot: RobotState, location: Location) -> dict[str, Array]:
+    """Return the numbers of a state, clamped to the range of float32.
+
+    Args:
+        robot: The state.
+        location: Names a number in the error.
+
+    Returns:
+        q, dq, tau, quaternion, angular_velocity, linear_acceleration and foot_force by name.
+
+    Raises:
+        WireError: A number is not finite.
+    """
+    numbers = np.concatenate([getattr(robot, field) for field in _STATE_SLICES])
+    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
+        raise not_finite("state", {field: getattr(robot, field) for field in _STATE_SLICES}, location)
+    numbers = np.minimum(np.maximum(numbers, -FLOAT32_MAX), FLOAT32_MAX)
+    return {field: numbers[part] for field, part in _STATE_SLICES.items()}
+
+
+def not_finite(kind: str, numbers: Mapping[str, NDArray[np.floating[Any]]], location: Location) -> WireError:
     """Create the error for the first field with a number that is not finite.
 
     Args:

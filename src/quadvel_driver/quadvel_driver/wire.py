@@ -10,7 +10,6 @@ so that no flipped bit passes.
 
 from __future__ import annotations
 
-from itertools import accumulate
 from typing import Any, Final
 
 import numpy as np
@@ -22,20 +21,23 @@ from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, Ro
 
 from .board_state import BoardState
 from .packets import (
-    FLOAT32_MAX,
+    JOINTS,
     LENGTH,
     POSITION_OFF,
+    SLOTS,
     VELOCITY_OFF,
     WireError,
     check_crc,
+    command_numbers,
     crc,
     decode_remote,
     encode_remote,
     not_finite,
+    require_finite_command,
     roll_pitch_yaw,
+    state_numbers,
 )
 
-JOINTS = len(JOINT_NAMES)
 LOW_LEVEL = 0xFF  # levelFlag of a joint command
 
 _HEADER = [
@@ -69,11 +71,10 @@ _IMU = [
     *(("rpy", "<f4", 3), ("imu_temperature", "i1")),
 ]
 _IMU_OFFSET, _IMU_NUMBERS = 10, 10  # byte offset, and count of the IMU numbers before rpy
-_SLOTS = 20  # motors in a packet; the AlienGo uses the first twelve
-_COMMAND: Final = np.dtype([*_HEADER, ("motors", _MOTOR_COMMAND, _SLOTS), ("led", "V12"), *_TAIL])
+_COMMAND: Final = np.dtype([*_HEADER, ("motors", _MOTOR_COMMAND, SLOTS), ("led", "V12"), *_TAIL])
 _STATE: Final = np.dtype(
     [
-        *(*_HEADER, *_IMU, ("motors", _MOTOR_STATE, _SLOTS)),
+        *(*_HEADER, *_IMU, ("motors", _MOTOR_STATE, SLOTS)),
         *(("foot_force", "<i2", 4), ("foot_force_estimate", "<i2", 4), ("tick", "<u4"), *_TAIL),
     ]
 )
@@ -99,16 +100,6 @@ _COMMAND_MIN = np.array([[-100.0], [-1000.0], [-_COUNTS / _TAU_COUNTS_PER_NM], [
 _COMMAND_MAX = np.array(
     [[100.0], [1000.0], *([(_COUNTS - 1) / scale] for scale in (_TAU_COUNTS_PER_NM, _KP, _KD))]
 )
-_COMMAND_FIELDS = ("q", "dq", "tau", "kp", "kd")
-_STATE_LENGTHS = {
-    **dict.fromkeys(("q", "dq", "tau"), JOINTS),
-    **{"quaternion": 4, "angular_velocity": 3, "linear_acceleration": 3, "foot_force": 4},
-}
-# Slice of each field in the concatenated numbers.
-_STATE_SLICES = {
-    field: slice(end - length, end)
-    for (field, length), end in zip(_STATE_LENGTHS.items(), accumulate(_STATE_LENGTHS.values()), strict=True)
-}
 
 _AXES = ("w", "x", "y", "z")
 
@@ -130,9 +121,7 @@ def encode_command(command: JointCommand) -> bytes:
     """
     if command.mode not in (MODE_DAMPING, MODE_SERVO):
         raise WireError(f"command: mode is {command.mode}, expected {MODE_DAMPING} or {MODE_SERVO}")
-    numbers = np.array((command.q, command.dq, command.tau, command.kp, command.kd), float)
-    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
-        raise not_finite("command", dict(zip(_COMMAND_FIELDS, numbers, strict=True)), _location)
+    numbers = command_numbers(command, _location)
     numbers = np.minimum(np.maximum(numbers, _COMMAND_MIN), _COMMAND_MAX).astype(np.float32)
     packet = np.zeros(1, _COMMAND)
     packet["level_flag"] = LOW_LEVEL
@@ -163,10 +152,9 @@ def decode_command(data: bytes) -> JointCommand:
         found = f"0x{packet['level_flag']:02X}"
         raise WireError(f"command: levelFlag is {found}, expected 0x{LOW_LEVEL:02X}: the low level")
     motors = packet["motors"][:JOINTS]
-    numbers = np.concatenate((motors["q"], motors["dq"]))
-    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # before the cast, which warns of NaN
-        raise not_finite("command", {"q": motors["q"], "dq": motors["dq"]}, _location)
-    q, dq = numbers.astype(float).reshape(2, JOINTS)
+    numbers = np.array((motors["q"], motors["dq"]))
+    require_finite_command(numbers, _location)  # before the cast, which warns of NaN
+    q, dq = numbers.astype(float)
     no_position, no_velocity = q >= POSITION_OFF, dq >= VELOCITY_OFF
     mode = _mode(motors["mode"])
     brakes = (motors["mode"] == MODE_DAMPING) & (mode == MODE_SERVO)
@@ -208,11 +196,7 @@ def encode_state(state: BoardState) -> bytes:
         WireError: A number is not finite.
     """
     robot = state.robot
-    numbers = np.concatenate([getattr(robot, field) for field in _STATE_SLICES])
-    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
-        raise not_finite("state", {field: getattr(robot, field) for field in _STATE_SLICES}, _location)
-    numbers = np.minimum(np.maximum(numbers, -FLOAT32_MAX), FLOAT32_MAX)
-    clipped = {field: numbers[part] for field, part in _STATE_SLICES.items()}
+    clipped = state_numbers(robot, _location)
     packet = np.zeros(1, _STATE)
     for field in ("quaternion", "angular_velocity", "linear_acceleration"):
         packet[field] = clipped[field]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_driver.board_state import Battery, BoardState, Remote
 from quadvel_driver.calibration import Calibration
-from quadvel_driver.packets import CONTENT, WireError
+from quadvel_driver.packets import CONTENT, JOINTS, WireError
 from quadvel_sim.bad_network import BadNetwork, NetworkConfig
 from quadvel_sim.loop import SimulationLoop
 
@@ -28,7 +28,6 @@ STOP_POLL_PERIOD_S = 0.1
 """Longest wait in s between two checks whether the board must stop."""
 TEMPERATURE_DEGC = 35
 """Reported temperature of motors and IMU; heating is not simulated."""
-JOINTS = 12
 _TICK_MODULUS = 2**32
 
 

@@ -21,6 +21,7 @@ from quadvel_description.state import JointCommand
 from quadvel_driver.board_state import Battery
 from quadvel_driver.calibration import Calibration
 from quadvel_driver.link import NO_CALIBRATION
+from quadvel_driver.packets import JOINTS
 from quadvel_driver.unitree_dds import wire
 from quadvel_driver.unitree_dds.bus import Bus
 from quadvel_driver.unitree_dds.motion_switcher import REQUEST_TOPIC, RESPONSE_TOPIC, Api
@@ -34,7 +35,7 @@ from quadvel_driver.unitree_dds.types import (
     ResponseStatus,
 )
 from quadvel_sim.bad_network import NetworkConfig
-from quadvel_sim.board import JOINTS, Board
+from quadvel_sim.board import Board
 
 OWN_CONTROLLER = "mcf"
 """Name of the robot's own controller at the start."""

@@ -11,7 +11,6 @@ hip, thigh, calf. `link` handles time, `bus` handles DDS.
 
 from __future__ import annotations
 
-from itertools import accumulate
 from typing import Any, Final
 
 import numpy as np
@@ -21,21 +20,24 @@ from quadvel_description.state import MODE_SERVO, JointCommand, RobotState
 from quadvel_driver.board_state import Battery, BoardState
 from quadvel_driver.packets import (
     FLOAT32_MAX,
+    JOINTS,
     LENGTH,
     POSITION_OFF,
     REMOTE,
+    SLOTS,
     VELOCITY_OFF,
     WireError,
     check_crc,
+    command_numbers,
     crc,
     decode_remote,
     encode_remote,
     not_finite,
+    require_finite_command,
     roll_pitch_yaw,
+    state_numbers,
 )
 
-JOINTS = 12  # of the 20 motors
-SLOTS = 20
 MOTOR_OFF, MOTOR_SERVO = 0, 1  # modes of a motor; a motor that is off turns freely
 HEADER: Final = bytes([0, 1, 0, 0])  # plain CDR, little endian, no options
 HEAD: Final = bytes([0xFE, 0xEF])
@@ -80,17 +82,7 @@ _STATE: Final[np.dtype[Any]] = np.dtype(
 )
 _IMU_AT, _IMU_NUMBERS = 28, 10  # quaternion, angular velocity, linear acceleration
 
-_COMMAND_FIELDS = ("q", "dq", "tau", "kp", "kd")
 _COMMAND_MIN = np.array([[-FLOAT32_MAX], [-FLOAT32_MAX], [-FLOAT32_MAX], [0.0], [0.0]])
-_STATE_LENGTHS = {
-    **dict.fromkeys(("q", "dq", "tau"), JOINTS),
-    **{"quaternion": 4, "angular_velocity": 3, "linear_acceleration": 3, "foot_force": 4},
-}
-# Slice of each field in the concatenated numbers.
-_STATE_SLICES = {
-    field: slice(end - length, end)
-    for (field, length), end in zip(_STATE_LENGTHS.items(), accumulate(_STATE_LENGTHS.values()), strict=True)
-}
 
 
 def _command_template() -> bytes:
@@ -147,9 +139,7 @@ def encode_command(command: JointCommand) -> bytes:
     """
     if command.mode != MODE_SERVO:
         raise WireError(f"command: mode is {command.mode}, expected {MODE_SERVO}")
-    numbers = np.array((command.q, command.dq, command.tau, command.kp, command.kd), float)
-    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
-        raise not_finite("command", dict(zip(_COMMAND_FIELDS, numbers, strict=True)), _location)
+    numbers = command_numbers(command, _location)
     sample = bytearray(_COMMAND_TEMPLATE)
     _command_numbers(sample)[:] = np.minimum(np.maximum(numbers, _COMMAND_MIN), FLOAT32_MAX).T
     sample[-4:] = crc(command_struct(sample)).to_bytes(4, "little")
@@ -173,8 +163,7 @@ def decode_command(data: bytes) -> JointCommand:
         found, expected = data[_HEAD_AT : _LEVEL_AT + 1].hex(), (HEAD + bytes([LOW_LEVEL])).hex()
         raise WireError(f"command: head and level_flag are {found}, expected {expected}: the low level")
     numbers = _command_numbers(data).T
-    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # before the cast, which warns of NaN
-        raise not_finite("command", dict(zip(_COMMAND_FIELDS, numbers, strict=True)), _location)
+    require_finite_command(numbers, _location)  # before the cast, which warns of NaN
     off = commanded_modes(data) == MOTOR_OFF
     q, dq, tau, kp, kd = numbers.astype(float)
     no_position, no_velocity = q >= POSITION_OFF, dq >= VELOCITY_OFF
@@ -224,11 +213,7 @@ def encode_state(state: BoardState) -> bytes:
         WireError: A number is not finite.
     """
     robot = state.robot
-    numbers = np.concatenate([getattr(robot, field) for field in _STATE_SLICES])
-    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
-        raise not_finite("state", {field: getattr(robot, field) for field in _STATE_SLICES}, _location)
-    numbers = np.minimum(np.maximum(numbers, -FLOAT32_MAX), FLOAT32_MAX)
-    clipped = {field: numbers[part] for field, part in _STATE_SLICES.items()}
+    clipped = state_numbers(robot, _location)
     sample = bytearray(STATE_BYTES)
     sample[: len(HEADER)] = HEADER
     sample[_HEAD_AT : _LEVEL_AT + 1] = HEAD + bytes([LOW_LEVEL])
@@ -318,7 +303,7 @@ def _check(kind: str, data: bytes, length: int, struct: Any) -> None:
 
 def _command_numbers(sample: bytes | bytearray) -> NDArray[np.float32]:
     """Return a view of q, dq, tau, kp and kd of the joints, (12, 5)."""
-    return np.ndarray((JOINTS, len(_COMMAND_FIELDS)), "<f4", sample, _COMMAND_MOTORS_AT, (_COMMAND_STRIDE, 4))
+    return np.ndarray((JOINTS, len(_COMMAND_MIN)), "<f4", sample, _COMMAND_MOTORS_AT, (_COMMAND_STRIDE, 4))
 
 
 def _location(field: str, i: int) -> str:
