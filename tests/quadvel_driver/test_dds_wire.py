@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
+from quadvel_description.state import MODE_DAMPING, JointCommand
 from quadvel_driver.board_state import Battery, BoardState, Button, Remote
 from quadvel_driver.packets import WireError, crc
 from quadvel_driver.unitree_dds import wire
+from tests.helpers.boards import equal, random_state
 
 # The C structures whose bytes the CRC covers, and the CDR bodies, written down a second time.
 HEAD = "2BBB2I2IH"
@@ -35,41 +36,8 @@ COMMAND = JointCommand(
 
 
 def some_state(seed: int = 0) -> BoardState:
-    """Numbers that a robot may report, exact in float32."""
-    rng = np.random.default_rng(seed)
-
-    def numbers(size: int, step: float, reach: int) -> np.ndarray:
-        return step * rng.integers(-reach, reach, size)
-
-    robot = RobotState(
-        time=0.0,
-        tick=int(rng.integers(1, 2**32)),
-        q=numbers(12, 2**-10, 3000),
-        dq=numbers(12, 2**-10, 20000),
-        tau=numbers(12, 2**-8, 10000),
-        quaternion=np.array([0.5, -0.5, 0.5, 0.5]),
-        angular_velocity=numbers(3, 2**-10, 3000),
-        linear_acceleration=numbers(3, 2**-10, 20000),
-        foot_force=numbers(4, 1.0, 300),
-    )
-    return BoardState(
-        robot=robot,
-        motor_mode=np.full(12, 1, np.uint8),
-        motor_error=np.arange(12, dtype=np.uint32),
-        temperature=rng.integers(-20, 100, 12).astype(np.int8),
-        imu_temperature=-3,
-        remote=Remote(Button.L1 | Button.UP, lx=-0.5, ly=0.25, rx=1.0, ry=-1.0),
-        battery=Battery(charge=77, voltage=29.5, current=-2.25),
-    )
-
-
-def equal(a: object, b: object) -> bool:
-    """Whether two records hold the same, arrays included."""
-    pairs = zip(attrs.astuple(a, recurse=False), attrs.astuple(b, recurse=False), strict=True)
-    return all(
-        equal(x, y) if attrs.has(type(x)) else np.array_equal(x, y)  # type: ignore[arg-type]
-        for x, y in pairs
-    )
+    battery = Battery(charge=77, voltage=29.5, current=-2.25)
+    return random_state(seed, wire.MOTOR_SERVO, imu_temperature=-3, battery=battery)
 
 
 COMMAND_SAMPLE, STATE_SAMPLE = wire.encode_command(COMMAND), wire.encode_state(some_state())

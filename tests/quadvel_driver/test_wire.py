@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import struct
 
-import attrs
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
+from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand
 from quadvel_driver import wire
 from quadvel_driver.board_state import BoardState, Button, Remote
 from quadvel_driver.packets import WireError
+from tests.helpers.boards import equal, random_state
 
 # The formats, written down a second time: struct instead of NumPy, as the fact sheet gives them.
 MOTOR_COMMAND = "BffhhhIII"
@@ -35,40 +35,7 @@ def slow_crc(data: bytes) -> int:
 
 
 def some_state(seed: int = 0) -> BoardState:
-    """Numbers that a robot may report, exact in the packet's own resolution."""
-    rng = np.random.default_rng(seed)
-
-    def numbers(size: int, step: float, reach: int) -> np.ndarray:
-        return step * rng.integers(-reach, reach, size)
-
-    robot = RobotState(
-        time=0.0,
-        tick=int(rng.integers(1, 2**32)),
-        q=numbers(12, 2**-10, 3000),
-        dq=numbers(12, 2**-10, 20000),
-        tau=numbers(12, 2**-8, 10000),
-        quaternion=np.array([0.5, -0.5, 0.5, 0.5]),
-        angular_velocity=numbers(3, 2**-10, 3000),
-        linear_acceleration=numbers(3, 2**-10, 20000),
-        foot_force=numbers(4, 1.0, 300),
-    )
-    return BoardState(
-        robot=robot,
-        motor_mode=np.full(12, MODE_SERVO, np.uint8),
-        motor_error=np.arange(12, dtype=np.uint32),
-        temperature=rng.integers(-20, 100, 12).astype(np.int8),
-        imu_temperature=41,
-        remote=Remote(Button.L1 | Button.UP, lx=-0.5, ly=0.25, rx=1.0, ry=-1.0),
-    )
-
-
-def equal(a: object, b: object) -> bool:
-    """Whether two records hold the same, arrays included."""
-    pairs = zip(attrs.astuple(a, recurse=False), attrs.astuple(b, recurse=False), strict=True)
-    return all(
-        equal(x, y) if attrs.has(type(x)) else np.array_equal(x, y)  # type: ignore[arg-type]
-        for x, y in pairs
-    )
+    return random_state(seed, MODE_SERVO, imu_temperature=41)
 
 
 COMMAND_PACKET = wire.encode_command(SEED_OF_GOLDEN)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -22,39 +22,24 @@ from quadvel_driver.link import NO_CALIBRATION, Link
 from quadvel_driver.udp import UdpConfig, UdpTransport
 from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.board import Board, BoardError
-from quadvel_sim.loop import SimulationLoop
 from quadvel_sim.simulator import Simulator
 from quadvel_sim.udp_board import UdpBoard
+from tests.helpers.boards import running, wait_for
 
 Wait = Callable[[Callable[[], object]], None]
-
-
-def wait_for(condition: Callable[[], object], board: Board) -> None:
-    deadline = time.monotonic() + 30.0
-    while not condition():
-        assert time.monotonic() < deadline, f"time is up; {board.counts}, {board.last_refusal}"
-        time.sleep(0.005)
 
 
 @pytest.fixture
 def serve() -> Iterator[Callable[..., Board]]:
     """Runs a robot that stands behind a board on any free port."""
-    ends: list[Callable[[], None]] = []
+    with ExitStack() as ends:
 
-    def begin(off: Calibration = NO_CALIBRATION, **network: float) -> Board:
-        board = UdpBoard(("127.0.0.1", 0), NetworkConfig(**network), off)
-        simulator = Simulator()
-        simulator.reset("stand")
-        board.loop = SimulationLoop(simulator, board.publish, period=2, answer_timeout=0.0)
-        threads = [threading.Thread(target=run) for run in (board.run, board.loop.run)]
-        for thread in threads:
-            thread.start()
-        ends.extend((board.loop.stop, board.stop, *(thread.join for thread in threads)))
-        return board
+        def begin(off: Calibration = NO_CALIBRATION, **network: float) -> Board:
+            board = UdpBoard(("127.0.0.1", 0), NetworkConfig(**network), off)
+            ends.enter_context(running(board, Simulator()))
+            return board
 
-    yield begin
-    for end in ends:
-        end()
+        yield begin
 
 
 @pytest.fixture
@@ -103,7 +88,7 @@ def test_a_robot_whose_sensors_are_off_is_set_right_by_its_calibration(serve: Se
     off = Calibration(joint_zeros=np.tile([0.1, -0.1, 0.15], 4), imu_mounting=np.array([0.03, -0.02]))
     board = serve(off)
     _, states = link(board, off)
-    wait_for(lambda: len(states) > 200, board)
+    wait_for(lambda: len(states) > 500, board)
     robot, truth = states[-1].robot, board.loop.simulator
     np.testing.assert_allclose(truth.data.qpos[7:], NOMINAL_Q, atol=0.12)
     np.testing.assert_allclose(robot.q, truth.data.qpos[7:], atol=0.02)

@@ -7,8 +7,9 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,8 @@ from quadvel_driver.unitree_dds.types import LOW_CMD
 from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.dds_board import DdsBoard
-from quadvel_sim.loop import SimulationLoop
 from quadvel_sim.simulator import Simulator
+from tests.helpers import boards
 
 DOMAIN, INTERFACE = int(os.environ["ROS_DOMAIN_ID"]), "lo"
 PATIENCE_S = 40.0
@@ -40,32 +41,21 @@ VENDOR_CLIENT = Path(__file__).with_name("vendor_client.py")
 TARGET = np.array(NOMINAL_Q) + np.where(np.arange(12) == 3, 0.2, 0.0)  # the hip FL moves outward
 
 
-def wait_for(condition: Callable[[], object], board: DdsBoard) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline, f"time is up; {board.counts}, {board.last_refusal}"
-        time.sleep(0.005)
+wait_for = partial(boards.wait_for, patience=PATIENCE_S)
 
 
 @pytest.fixture
 def serve() -> Iterator[Callable[..., DdsBoard]]:
     """Runs a robot that hangs in the air behind a board."""
-    ends: list[Callable[[], None]] = []
+    with ExitStack() as ends:
 
-    def begin(**network: float) -> DdsBoard:
-        board = DdsBoard(Bus(DOMAIN, INTERFACE), NetworkConfig(**network))
-        simulator = Simulator(SimulatorConfig(suspended=True, watchdog=0.5))
-        simulator.reset("stand")
-        board.loop = SimulationLoop(simulator, board.publish, period=2, answer_timeout=0.0)
-        threads = [threading.Thread(target=run) for run in (board.run, board.loop.run)]
-        for thread in threads:
-            thread.start()
-        ends.extend((board.loop.stop, board.stop, *(thread.join for thread in threads)))
-        return board
+        def begin(**network: float) -> DdsBoard:
+            board = DdsBoard(Bus(DOMAIN, INTERFACE), NetworkConfig(**network))
+            simulator = Simulator(SimulatorConfig(suspended=True, watchdog=0.5))
+            ends.enter_context(boards.running(board, simulator))
+            return board
 
-    yield begin
-    for end in ends:
-        end()
+        yield begin
 
 
 class Driven:
