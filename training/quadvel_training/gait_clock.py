@@ -108,17 +108,18 @@ class GaitClock:
         """
         return np.asarray(((self.phase + ahead)[:, None] + FOOT_PHASES) % 1.0)
 
-    def swing_share(self, command: np.ndarray) -> np.ndarray:
+    def swing_share(self, command: np.ndarray, ahead: np.ndarray | float = 0.0) -> np.ndarray:
         """Return how much of each foot's planned swing is over.
 
         Args:
             command: (n, 4).
+            ahead: (n,), cycles added to the phase.
 
         Returns:
             (n, 4), 0 at lift-off to 1 at touchdown; negative while the foot is planned to be down.
         """
         duty = duty_factor(command)[:, None]
-        return np.asarray((self.foot_phases() - duty) / (1.0 - duty))
+        return np.asarray((self.foot_phases(ahead) - duty) / (1.0 - duty))
 
     def observation(self, command: np.ndarray) -> np.ndarray:
         """Return what the teacher sees of its clock.

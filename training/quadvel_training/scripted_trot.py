@@ -38,10 +38,9 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
     command = env.command
     vx, vy, wz, standing = command.T
     duty, frequency = duty_factor(command), step_frequency(command)
-    phases = clock.foot_phases(ahead=LEAD_S * frequency)
-    # s: share of the planned swing that is over, below 0 in the stance
-    share = (phases - duty[:, None]) / (1.0 - duty[:, None])
-    swing, down = np.maximum(share, 0.0), share < 0.0
+    ahead = LEAD_S * frequency
+    phases, share = clock.foot_phases(ahead), clock.swing_share(command, ahead)
+    swing, down = np.maximum(share, 0.0), share < 0.0  # s: share of the planned swing that is over
     # velocity of the ground under a foot at (x, y): -(vx - wz y, vy + wz x); a stance lasts duty / f
     under = np.stack(
         [vx[:, None] - wz[:, None] * FEET[:, 1], vy[:, None] + wz[:, None] * FEET[:, 0]], axis=-1
