@@ -81,6 +81,12 @@ class Hypothesis:
         """Both errors in units of their scales."""
         return float(np.hypot(self.turn / TURN_SCALE_RAD, self.vertical / VERTICAL_SCALE_RAD))
 
+    def __str__(self) -> str:
+        """How badly the conventions fit, in words."""
+        return (
+            f"turns differ by {1e3 * self.turn:.1f} mrad in 50 ms and the vertical by {self.vertical:.2f} rad"
+        )
+
     @property
     def is_usual(self) -> bool:
         """Whether these are the conventions of this stack."""
@@ -94,6 +100,7 @@ class ImuHypotheses:
         assert run.imu is not None
         self._run, self._imu = run, run.imu
         self._m = max(2, round(WINDOW_S / run.period))
+        self._turns: dict[str, Array] = {}
 
     @cached_property
     def usual(self) -> Hypothesis:
@@ -116,6 +123,11 @@ class ImuHypotheses:
         Returns:
             Rotation vectors.
         """
+        if quaternion not in self._turns:
+            self._turns[quaternion] = self._compute_turns(quaternion)
+        return self._turns[quaternion]
+
+    def _compute_turns(self, quaternion: str) -> Array:
         q = QUATERNIONS[quaternion](self._imu.quaternion)
         w0, v0, w1, v1 = q[: -self._m, :1], q[: -self._m, 1:], q[self._m :, :1], q[self._m :, 1:]
         vector = w0 * v1 - w1 * v0 - np.cross(v0, v1)  # of q0^-1 q1
@@ -143,19 +155,10 @@ class ImuHypotheses:
         return np.asarray(total[self._m :] - total[: -self._m])
 
     def _hypothesis(self, quaternion: str, gyroscope: str) -> Hypothesis:
-        off = self._cached_turns(quaternion) - self.integrals(gyroscope)
+        off = self.turns(quaternion) - self.integrals(gyroscope)
         whole = np.linalg.norm(off, axis=1)
         turn = float(np.sqrt(np.mean(np.minimum(whole, 3.0) ** 2)))
         return Hypothesis(quaternion, gyroscope, turn, self._vertical_error(quaternion))
-
-    def _cached_turns(self, quaternion: str) -> Array:
-        if quaternion not in self._turns:
-            self._turns[quaternion] = self.turns(quaternion)
-        return self._turns[quaternion]
-
-    @cached_property
-    def _turns(self) -> dict[str, Array]:
-        return {}
 
     def _vertical_error(self, quaternion: str) -> float:
         """Median angle between mean acceleration in the world frame and the vertical, rad."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 from functools import cached_property
 from itertools import combinations
 
+import attrs
 import numpy as np
 
 from quadvel_description.arrays import Array, Bools
@@ -28,6 +29,23 @@ BALANCE_WINDOW_S, MIN_BALANCE_ROWS = 0.05, 60
 DAMPING_M2 = 1e-4
 """Of the least squares of the forces, near a straight leg."""
 PAIRS = tuple(combinations(range(4), 2))
+
+
+@attrs.frozen(eq=False)
+class GroundPlane:
+    """Slope that fits the pairs of planted feet best.
+
+    Attributes:
+        slope: (2,), rise per metre along x and y of the world.
+        heights: (k,), height between the two feet of each pair, m, in the order of time.
+        on_slope: (k,), the same on that slope, m.
+        time: (k,), s.
+    """
+
+    slope: Array
+    heights: Array
+    on_slope: Array
+    time: Array
 
 
 class Legs:
@@ -120,6 +138,21 @@ class Legs:
         found = [(self.height[:, i] - self.height[:, j])[rows] for i, j, rows in self.pair_rows()]
         values = np.concatenate(found)
         return float(1.4826 * np.median(np.abs(values))) if len(values) else float("inf")
+
+    @cached_property
+    def plane(self) -> GroundPlane:
+        """Slope of the ground under the planted feet, by least squares."""
+        world = self._to_world(self.feet)
+        heights, apart, times = [], [], []
+        for i, k, rows in self.pair_rows():
+            heights.append((self.height[:, i] - self.height[:, k])[rows])
+            apart.append((world[:, i, :2] - world[:, k, :2])[rows])
+            times.append(self.run.time[rows])
+        z, d, time = np.concatenate(heights), np.concatenate(apart), np.concatenate(times)
+        order = np.argsort(time, kind="stable")
+        z, d, time = z[order], d[order], time[order]
+        slope = np.linalg.solve(d.T @ d + 1e-3 * np.eye(2), d.T @ z)
+        return GroundPlane(np.asarray(slope), np.asarray(z), np.asarray(d @ slope), time)
 
     @cached_property
     def trunk_velocity(self) -> Array:

@@ -96,7 +96,7 @@ class Signals:
             "torque": run.tau is not None and bool(np.any(run.tau)) and self.torque.is_usable,
             "imu": run.imu is not None,
             "robot": run.is_own,
-            "policy": self.policy is not None and PolicyReplay(run, self.policy).is_usable,
+            "policy": self.policy is not None and self.replay.is_usable,
             "estimate": run.estimate is not None,
             "temperature": run.temperature is not None,
             "command": run.velocity_command is not None and self.policy is not None,
@@ -113,6 +113,15 @@ class Signals:
     def legs(self) -> Legs:
         """Forces, velocities and heights of the feet."""
         return Legs(self.run)
+
+    @cached_property
+    def estimate(self) -> Array:
+        """Estimated velocity at the times of the states, (n, 3), m/s, body frame."""
+        run = self.run
+        assert run.estimate is not None
+        return np.column_stack(
+            [np.interp(run.time, run.estimate.time, axis) for axis in run.estimate.value.T]
+        )
 
     @cached_property
     def imu(self) -> ImuHypotheses:

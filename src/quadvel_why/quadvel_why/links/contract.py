@@ -13,7 +13,7 @@ from quadvel_description.arrays import Array
 from ..cause import NOTHING, Cause, Link, Measurement, Trace, worst_span
 from ..explanation import Explanation
 from ..hypotheses import CONVENTIONS, best_convention, best_offset
-from ..imu import USUAL_GYROSCOPE, USUAL_QUATERNION, Hypothesis
+from ..imu import USUAL_GYROSCOPE, USUAL_QUATERNION
 from ..signals import Signals
 
 CLEAR_COEFFICIENT = 0.3
@@ -392,29 +392,37 @@ class GyroFrame(Cause):
         return _imu_measurement(signals, USUAL_QUATERNION, imu.best.gyroscope)
 
 
-def _imu_measurement(signals: Signals, quaternion: str, gyroscope: str) -> Measurement:
-    """Improvement by other conventions, with the axis that differs most as a picture."""
+def turn_evidence(signals: Signals) -> tuple[Trace, tuple[float, float]]:
+    """Compare the turns of the orientation with the integrated gyroscope, both read as usual.
+
+    Args:
+        signals: The run.
+
+    Returns:
+        The axis that differs most, and the span in which the turns differ most, s.
+    """
     imu, time = signals.imu, signals.run.time
-    usual, best = imu.usual, imu.best
-    if usual.error < MIN_IMU_ERROR:
-        return Measurement(1.0)
     turns, expected = imu.turns(USUAL_QUATERNION), imu.integrals(USUAL_GYROSCOPE)
     axis = int(np.argmax(np.mean((turns - expected) ** 2, axis=0)))
     middle = time[len(time) - len(turns) :]
     trace = Trace(f"turn about {'xyz'[axis]} in 50 ms and integrated gyroscope, rad", middle, turns[:, axis],
                   expected[:, axis])  # fmt: skip
+    return trace, worst_span(middle, np.linalg.norm(turns - expected, axis=1))
+
+
+def _imu_measurement(signals: Signals, quaternion: str, gyroscope: str) -> Measurement:
+    """Improvement by other conventions, with the axis that differs most as a picture."""
+    usual, best = signals.imu.usual, signals.imu.best
+    if usual.error < MIN_IMU_ERROR:
+        return Measurement(1.0)
+    trace, span = turn_evidence(signals)
     what = f"as {quaternion}" if quaternion != USUAL_QUATERNION else f"with the gyroscope as {gyroscope}"
-    sentence = f"{_imu_text(usual)}; read {what}: {_imu_text(best)}"
-    span = worst_span(middle, np.linalg.norm(turns - expected, axis=1))
+    sentence = f"{usual}; read {what}: {best}"
     return Measurement(usual.error / max(best.error, 1e-6), sentence, span, (trace,))
 
 
 MIN_IMU_ERROR = 1.5
 """Error of the usual conventions, in units of their scales, from which others are considered."""
-
-
-def _imu_text(h: Hypothesis) -> str:
-    return f"turns differ by {1e3 * h.turn:.1f} mrad in 50 ms and the vertical by {h.vertical:.2f} rad"
 
 
 class _Actions(Cause):

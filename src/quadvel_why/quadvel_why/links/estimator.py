@@ -57,14 +57,10 @@ def fit_estimate(signals: Signals) -> EstimateFit | None:
         The fit; None if the run shows too little.
     """
     run = signals.run
-    assert run.estimate is not None
     own = {"torque", "imu", "robot"} <= signals.parts
     if not own:
         return None
-    estimate = np.column_stack(
-        [np.interp(run.time, run.estimate.time, axis) for axis in run.estimate.value.T]
-    )
-    replayed = signals.replayed_estimate
+    estimate, replayed = signals.estimate, signals.replayed_estimate
     use = run.walking & np.isfinite(replayed).all(axis=1)
     if use.sum() < MIN_ROWS:
         return None

@@ -40,14 +40,10 @@ class Slipping(Cause):
     @override
     def measure(self, signals: Signals) -> Measurement | None:
         run, legs = signals.run, signals.legs
-        assert run.estimate is not None
         loaded = _loaded(legs)
         if loaded.sum() < MIN_ROWS:
             return None
-        estimate = np.column_stack(
-            [np.interp(run.time, run.estimate.time, axis) for axis in run.estimate.value.T]
-        )
-        world = (estimate[:, None] @ legs.rotation.swapaxes(-1, -2))[:, 0]
+        world = (signals.estimate[:, None] @ legs.rotation.swapaxes(-1, -2))[:, 0]
         slip = np.linalg.norm((legs.velocity - world[:, None])[..., :2], axis=-1)
         value = float(np.percentile(slip[loaded], 75))
         force = legs.force[loaded]
@@ -61,21 +57,6 @@ class Slipping(Cause):
         return Measurement(value, sentence, worst_span(run.time, per_state), (trace,))
 
 
-def _plane(legs: Legs) -> tuple[Array, Array, Array, Array]:
-    """Slope (2,), heights, heights on that slope and times of pairs of planted feet, by least squares."""
-    world = np.asarray(legs.feet @ legs.rotation.swapaxes(-1, -2))
-    heights, apart, times = [], [], []
-    for i, k, rows in legs.pair_rows():
-        heights.append((legs.height[:, i] - legs.height[:, k])[rows])
-        apart.append((world[:, i, :2] - world[:, k, :2])[rows])
-        times.append(legs.run.time[rows])
-    z, d, time = np.concatenate(heights), np.concatenate(apart), np.concatenate(times)
-    order = np.argsort(time, kind="stable")
-    z, d, time = z[order], d[order], time[order]
-    slope = np.linalg.solve(d.T @ d + 1e-3 * np.eye(2), d.T @ z)
-    return slope, z, np.asarray(d @ slope), time
-
-
 class SteepGround(Cause):
     """The ground is steeper than where the policy was shown to walk."""
 
@@ -87,15 +68,20 @@ class SteepGround(Cause):
 
     @override
     def measure(self, signals: Signals) -> Measurement | None:
-        legs = signals.legs
-        if sum(int(rows.sum()) for _, _, rows in legs.pair_rows()) < MIN_ROWS:
+        plane = signals.legs.plane
+        if len(plane.time) < MIN_ROWS:
             return None
-        slope, heights, on_slope, time = _plane(legs)
-        angle = float(np.arctan(np.linalg.norm(slope)))
-        trace = Trace("height between planted feet and on that slope, m", time, heights, on_slope)
+        angle = float(np.arctan(np.linalg.norm(plane.slope)))
+        trace = Trace(
+            "height between planted feet and on that slope, m", plane.time, plane.heights, plane.on_slope
+        )
         sentence = f"planted feet lie on a slope of {np.rad2deg(angle):.0f} degrees"
         return Measurement(
-            angle, sentence, worst_span(time, np.abs(heights)), (trace,), limit=WALKED_SLOPE_RAD
+            angle,
+            sentence,
+            worst_span(plane.time, np.abs(plane.heights)),
+            (trace,),
+            limit=WALKED_SLOPE_RAD,
         )
 
 
@@ -110,17 +96,21 @@ class RoughGround(Cause):
 
     @override
     def measure(self, signals: Signals) -> Measurement | None:
-        legs = signals.legs
-        if sum(int(rows.sum()) for _, _, rows in legs.pair_rows()) < MIN_ROWS:
+        plane = signals.legs.plane
+        if len(plane.time) < MIN_ROWS:
             return None
-        _, heights, on_slope, time = _plane(legs)
-        off = heights - on_slope
+        off = plane.heights - plane.on_slope
         value = float(np.percentile(np.abs(off), 80))
-        trace = Trace("height between planted feet and on their mean slope, m", time, heights, on_slope)
+        trace = Trace(
+            "height between planted feet and on their mean slope, m",
+            plane.time,
+            plane.heights,
+            plane.on_slope,
+        )
         sentence = (
             f"one in five pairs of planted feet lies more than {100 * value:.1f} cm off their mean slope"
         )
-        return Measurement(value, sentence, worst_span(time, np.abs(off)), (trace,))
+        return Measurement(value, sentence, worst_span(plane.time, np.abs(off)), (trace,))
 
 
 class Payload(Cause):

@@ -7,6 +7,7 @@ from typing_extensions import override
 
 from ..cause import Cause, Link, Measurement, Trace, worst_span
 from ..signals import Signals
+from .contract import turn_evidence
 
 
 class EncoderHeld(Cause):
@@ -92,13 +93,6 @@ class ImuContradicts(Cause):
 
     @override
     def measure(self, signals: Signals) -> Measurement | None:
-        imu, time = signals.imu, signals.run.time
-        turns, expected = imu.turns("w, x, y, z"), imu.integrals("(x, y, z)")
-        axis = int(np.argmax(np.mean((turns - expected) ** 2, axis=0)))
-        middle = time[len(time) - len(turns) :]
-        trace = Trace(f"turn about {'xyz'[axis]} in 50 ms and integrated gyroscope, rad", middle, turns[:, axis],
-                      expected[:, axis])  # fmt: skip
-        usual = imu.usual
-        sentence = f"turns differ by {1e3 * usual.turn:.1f} mrad in 50 ms and the vertical by {usual.vertical:.2f} rad"
-        span = worst_span(middle, np.linalg.norm(turns - expected, axis=1))
-        return Measurement(usual.error, sentence, span, (trace,))
+        usual = signals.imu.usual
+        trace, span = turn_evidence(signals)
+        return Measurement(usual.error, str(usual), span, (trace,))
