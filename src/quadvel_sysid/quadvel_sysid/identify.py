@@ -16,6 +16,7 @@ import numpy as np
 
 from quadvel_actuator.parameters import ActuatorParameters
 
+from .data.clocks import known_offsets
 from .data.dataset import Dataset, Progress, no_progress
 from .data.noise import noise_variance
 from .data.plain_model import DRIVE_WINDOWS_S
@@ -143,7 +144,7 @@ def _identify_once(dataset: Dataset, options: IdentifyOptions, progress: Progres
         before=refitted[before],
         after=after,
         evidence=_evidence(search, searched.record, chosen, after, parts),
-        half_widths=intervals(after, parts, prepared.clock_offsets),
+        half_widths=intervals(after, parts, known_offsets(prepared.clocks)),
         noise=evaluator.noise,
         parts=parts,
         base=base,

@@ -51,6 +51,18 @@ class RecordingClock:
     half_width_s: float = 0.0
 
 
+def known_offsets(clocks: Sequence[RecordingClock]) -> tuple[float, ...]:
+    """Return the offsets of the recordings' commands that are known.
+
+    Args:
+        clocks: Clock of each recording.
+
+    Returns:
+        Offsets, s.
+    """
+    return tuple(one.offset_s for one in clocks if one.offset_s is not None)
+
+
 def choose_stamps(
     dataset: Dataset, windows: Sequence[float], length: float, options: SearchOptions
 ) -> tuple[Dataset, list[RecordingClock]]:

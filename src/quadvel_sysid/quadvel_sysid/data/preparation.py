@@ -54,11 +54,6 @@ class Preprocessed:
     eam: Eam
     clocks: tuple[RecordingClock, ...]
 
-    @property
-    def clock_offsets(self) -> tuple[float, ...]:
-        """Known offsets of the recordings' commands, s."""
-        return tuple(one.offset_s for one in self.clocks if one.offset_s is not None)
-
 
 def preprocess(
     dataset: Dataset,

@@ -13,7 +13,7 @@ from quadvel_actuator.effects.basis_regressors import LEARNED_RESIDUAL
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description.arrays import Array, Bools
 
-from ..data.clocks import RecordingClock
+from ..data.clocks import RecordingClock, known_offsets
 from ..data.plain_model import pd_torque
 from ..data.signals import Samples
 from ..data.split import DataSplit
@@ -162,7 +162,7 @@ def build_identification(outcome: Outcome, findings: Sequence[tuple[str, LogFind
         outcome.parts,
         outcome.base,
         outcome.half_widths.effects,
-        [one.offset_s for one in outcome.clocks if one.offset_s is not None],
+        known_offsets(outcome.clocks),
     )
     return Identification(report, corrected, _traces(outcome), _shapes(outcome))
 
@@ -227,14 +227,15 @@ def _report(o: Outcome) -> dict[str, Any]:
 
 def _clock_entry(clock: RecordingClock) -> dict[str, Any]:
     """Entry of the report for the clock of a recording."""
-    known = clock.offset_s is not None
-    ends = (clock.offset_s or 0.0) + clock.half_width_s * np.array([-1.0, 1.0])
+    offset, interval = clock.offset_s, None
+    if offset is not None:
+        interval = (1e3 * (offset + clock.half_width_s * np.array([-1.0, 1.0]))).tolist()
     return {
         "log": clock.log,
         "heldout": clock.heldout,
         "even": clock.even,
-        "command_offset_ms": 1e3 * clock.offset_s if clock.offset_s is not None else None,
-        "command_offset_ms_ci95": (1e3 * ends).tolist() if known else None,
+        "command_offset_ms": None if offset is None else 1e3 * offset,
+        "command_offset_ms_ci95": interval,
     }
 
 
