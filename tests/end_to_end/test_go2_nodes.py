@@ -1,6 +1,6 @@
 """The nodes `board` and `driver` with a Go2's interface between them, in the DDS domain of the ROS nodes themselves.
 
-A board waits for nobody, so this wants a machine with time to spare: pytest -m realtime.
+A board does not wait, so this needs a machine with time to spare: pytest -m realtime.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ def _driven(row, command, seed):
 
 
 def test_the_middle_of_the_equivalent_delays_on_a_grid_is_chosen():
-    """The drive's delay of 7 ms cannot be told from any above 6 ms."""
+    """The drive's delay of 7 ms cannot be distinguished from any above 6 ms."""
     log = _driven(0.001, 0.001, 1)
     samples = Samples.of([log])
     eam = fit_eam(samples, samples.evaluated)

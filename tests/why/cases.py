@@ -48,7 +48,7 @@ def all_cases(suite: int) -> Iterator[Case]:
 
 
 def record(case: Case, folder: Path, seconds: float = WALK_S) -> Path:
-    """Record a case unless its recording is there; the walk's fate lies beside it as JSON."""
+    """Record a case unless its recording is there; a JSON file next to it says how the walk ended."""
     path = folder / f"{case.name}.mcap"
     if path.exists():
         return path

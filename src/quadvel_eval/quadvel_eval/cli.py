@@ -151,7 +151,8 @@ def bench_command(
     ] = False,
     seconds: Annotated[float, typer.Option(min=1.0, metavar="<s>", help="Duration of --live, s.")] = 60.0,
     busy: Annotated[
-        int, typer.Option(min=0, metavar="<n>", help="Programs that compute without a pause beside --live.")
+        int,
+        typer.Option(min=0, metavar="<n>", help="Other programs that compute without a pause during --live."),
     ] = 0,
 ) -> None:
     """Measure how fast this machine simulates, infers, communicates and trains.

@@ -272,7 +272,7 @@ def ratios(figures: dict[str, float]) -> dict[str, float]:
 
 
 def _rows() -> Iterator[tuple[str, str, str]]:
-    """Yield the rows of the table: name of the figure, description, target of issue 52."""
+    """Yield the rows of the table: name of the figure, description, target."""
     for name in (*PROCESSES, "sleep"):
         yield f"{name}_cpu_us", f"{name}, processor time a tick, us", CPU_TARGETS.get(name, "")
         if name in NODES:

@@ -19,7 +19,7 @@ REST_ACCELERATION = np.array([0.0, 0.0, GRAVITY])
 
 
 BATCH = 4
-"""States that wait for the filter while nobody needs its velocity: 20 ms."""
+"""States that wait for the filter while its velocity is not needed: 20 ms."""
 _ARRAYS = [field.name for field in attrs.fields(RobotState) if field.name not in ("time", "tick")]
 
 

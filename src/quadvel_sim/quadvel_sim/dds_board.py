@@ -84,7 +84,7 @@ class DdsBoard(Board):
         self.select(OWN_CONTROLLER)
 
     def select(self, mode: str) -> None:
-        """Give the legs to one of the robot's own controllers, or to nobody.
+        """Give the legs to one of the robot's own controllers, or to none.
 
         Args:
             mode: Name of the controller, "" for none.

@@ -33,7 +33,7 @@ class Link(Enum):
 
 @attrs.frozen(eq=False)
 class Trace:
-    """A signal beside what was expected, for the picture.
+    """A signal, and what was expected, for the picture.
 
     Attributes:
         title: Name and unit.
@@ -57,7 +57,7 @@ class Measurement:
         sentence: What was found, with numbers and units.
         span: Begin and end of the time in which it shows, s.
         traces: For the picture.
-        alternatives: Names of causes that look the same in this recording, each with the experiment that tells them
+        alternatives: Names of causes that look the same in this recording, each with the experiment that sets them
             apart.
         limit: Limit that comes from the training of the policy, instead of healthy walks.
     """

@@ -99,7 +99,7 @@ def _explain(replay: PolicyReplay) -> Explanation:
 
 
 def _action_factor(replay: PolicyReplay) -> tuple[float, float]:
-    """Factor of the actions that fits best, and the difference that it leaves, rad."""
+    """Factor of the actions that fits best, and the remaining difference, rad."""
     base, offset = replay.base, np.array(replay.policy.metadata.action_offset)
     x, y = (base.expected - offset)[base.valid], (base.recorded - offset)[base.valid]
     factor = float(x @ y / (x @ x))

@@ -1,6 +1,6 @@
 """Hypotheses about states and commands together: what the drives cannot show, the planted feet do.
 
-If order, sign or zero are wrong in states and commands alike, every drive does as it is told. But then the legs
+If order, sign or zero are wrong in states and commands alike, every drive follows its command. But then the legs
 contradict each other: planted feet give different velocities of the trunk, and stand at different heights.
 """
 

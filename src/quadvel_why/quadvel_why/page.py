@@ -26,7 +26,7 @@ chain contract, timing, sensors, estimator, drives, ground, task:
     quadvel why fall.mcap --policy mine.onnx
     quadvel why walk.npz --gains 35 0.5  # joints of another robot, as `quadvel identify` reads them
 
-![Torque of a joint beside the torque that its command asks for](images/why.png)
+![Torque of a joint, and the torque that its command asks for](images/why.png)
 
 | exit code | meaning |
 |---|---|
@@ -36,7 +36,7 @@ chain contract, timing, sensors, estimator, drives, ground, task:
 
 The answer is one cause: the first that is found. Later ones may be its consequences, so they are not
 examined. Repair it, record again and ask again. If two causes look the same in the recording, both
-are named, with the experiment that tells them apart.
+are named, with the experiment that distinguishes them.
 
 A recording of this stack holds everything. Of another robot's `LowState` and `LowCmd`, or of a table,
 only the causes are examined that need no kinematics and no policy; the answer lists the others.

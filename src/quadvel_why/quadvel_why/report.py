@@ -92,7 +92,7 @@ def _finding_json(found: Finding) -> dict[str, Any]:
 
 
 def picture(found: Finding) -> Figure:
-    """Draw the signal beside what was expected: the span in which it shows, and the whole run.
+    """Draw the signal and what was expected: the span in which it shows, and the whole run.
 
     Args:
         found: The finding; it has at least one trace.

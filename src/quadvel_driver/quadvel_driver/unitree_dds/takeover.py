@@ -25,7 +25,7 @@ from .wire import MOTOR_OFF
 
 ASK_PERIOD_S = 0.5  # between two requests to the motion switcher
 ANSWER_TIMEOUT_S = 3.0  # without an answer: a robot without motion switcher
-RELEASE_TIMEOUT_S = 10.0  # without a release, after which the operator is told
+RELEASE_TIMEOUT_S = 10.0  # without a release, after which the operator is informed
 QUIET_S = 1.0  # without commands or writers of others, before the joints are taken
 BRAKE_S = 0.5  # time of braking after the joints are lost
 OBEY_TIMEOUT_S = 1.0  # of commands that motors do not follow

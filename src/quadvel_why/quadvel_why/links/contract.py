@@ -19,7 +19,7 @@ from ..signals import Signals
 CLEAR_COEFFICIENT = 0.3
 """Of the PD law; below that a coefficient says nothing about sign or scale."""
 UNEXPLAINED_SHARE = 0.1
-"""Share of a torque's variance that its own command leaves if another one is meant."""
+"""Share of a torque's variance that its own command leaves if the drive follows another one."""
 BETTER_PAIRING, MIN_ERROR_N2M2 = 4.0, 4.0
 """Factor by which another command explains the torque better, and the smallest error that needs it."""
 MAX_SPREAD_AT_REST_RAD = 0.02
@@ -32,7 +32,7 @@ MIN_AGREEING_JOINTS = 9
 
 
 def joint_trace(signals: Signals, joint: int, expected: Array | None = None) -> Trace:
-    """Return the torque of a joint beside the one that its command asks for.
+    """Return the torque of a joint, with the one that its command asks for.
 
     Args:
         signals: The run.
@@ -426,7 +426,7 @@ MIN_IMU_ERROR = 1.5
 
 
 class _Actions(Cause):
-    """Causes that the replay of the policy tells apart."""
+    """Causes that the replay of the policy distinguishes."""
 
     link = Link.CONTRACT
     unit = "rad"

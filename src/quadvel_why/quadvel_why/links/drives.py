@@ -53,7 +53,7 @@ class Temperature(Cause):
 
 
 class WeakDrive(Cause):
-    """One drive gives less torque than its command asks for, while the others do as they are told."""
+    """One drive gives less torque than its command asks for, while the others follow theirs."""
 
     link = Link.DRIVES
     unit = "share"

@@ -83,7 +83,7 @@ def _rms(values: Array) -> float:
 
 
 def _best_kind(time: Array, estimate: Array, reference: Array, use: Bools) -> tuple[str, float, float]:
-    """Bias, scale or lag: the kind that leaves least, its amount and what it leaves."""
+    """Bias, scale or lag: the kind with the smallest remaining error, its amount and that error."""
     off = (estimate - reference)[use][:, :2]
     bias = np.median(off, axis=0)
     found = [(_rms(off - bias), "bias", float(bias[np.argmax(np.abs(bias))]))]
