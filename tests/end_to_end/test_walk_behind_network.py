@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver import wire
-from quadvel_driver.aliengo import ALIENGO
+from quadvel_driver.aliengo import ALIENGO as DRIVEN
 from quadvel_driver.board_state import BoardState
 from quadvel_driver.link import Link, LinkConfig, Transport
 from quadvel_driver.unitree_dds import wire as dds_wire
@@ -24,6 +23,7 @@ from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.bad_network import BadNetwork, NetworkConfig
 from quadvel_sim.simulator import Simulator
+from tests.helpers.robots import ALIENGO
 
 BAD = NetworkConfig(network_loss=0.02, network_jitter=0.002)
 TURNS = 4  # of the link, a millisecond
@@ -62,7 +62,7 @@ class BehindNetwork:
         self._wire = Wire()
         self._newest: RobotState | None = None
         self.time = 50.0
-        self.link = Link(ALIENGO, packets, self._wire, LinkConfig(), self._on_state, clock=lambda: self.time)
+        self.link = Link(DRIVEN, packets, self._wire, LinkConfig(), self._on_state, clock=lambda: self.time)
         self._warming_up = True
         self.step(300)  # the link finds out in what unit the board counts
         self._warming_up = False
@@ -88,7 +88,7 @@ class BehindNetwork:
         for _ in range(n):
             if self._warming_up:
                 self._simulator.command(
-                    JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+                    JointCommand(q=np.array(ALIENGO.nominal_q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
                 )
             self._simulator.step(1)
             self._report()

@@ -7,12 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from quadvel_description import mjcf, robot
+from quadvel_description import mjcf
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_eval.robot_loop import RobotLoop, TrueVelocity
 from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
+from tests.helpers.robots import ALIENGO
 
 
 class StandingPolicy:
@@ -20,10 +21,12 @@ class StandingPolicy:
 
     def __init__(self) -> None:
         self.metadata = PolicyMetadata(
-            action_offset=tuple(robot.NOMINAL_Q + mjcf.gravity_torque(mjcf.load_model()) / robot.KP),
+            action_offset=tuple(
+                ALIENGO.nominal_q + mjcf.gravity_torque(mjcf.load_model(ALIENGO)) / ALIENGO.kp
+            ),
             action_scale=1.0,
-            kp=robot.KP,
-            kd=robot.KD,
+            kp=ALIENGO.kp,
+            kd=ALIENGO.kd,
             command_limits={"vx": (-2.0, 2.0), "vy": (-1.0, 1.0), "wz": (-2.0, 2.0)},
             state_shape=(1, 1, 1),
         )
@@ -48,7 +51,7 @@ def make_loop() -> Callable[..., RobotLoop]:
     """make_loop(seed) -> a robot in walk mode under a policy that stands."""
 
     def make(seed: int = 0) -> RobotLoop:
-        simulator = Simulator(SimulatorConfig(seed=seed))
+        simulator = Simulator(SimulatorConfig(robot=ALIENGO, seed=seed))
         simulator.reset("stand")
         beside = {"kalman": KalmanEstimator()}
         loop = RobotLoop(simulator, Supervisor(StandingPolicy()), TrueVelocity(simulator), beside)

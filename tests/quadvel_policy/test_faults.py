@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rig import FORWARD, PERIOD, STILL, Rig, assert_damping
 
-from quadvel_description.robot import NOMINAL_Q, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
+from quadvel_description.robot import ALIENGO, NOMINAL_Q, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy import command_limits
 from quadvel_policy.command_limits import LIMITS, JointCommandLimiter
@@ -439,7 +439,7 @@ def check_limit(policy: Any, name: str) -> None:
         assert (np.abs(torque) <= TORQUE_LIMIT + 1e-9).all()
         assert power <= 1800.0 + 1e-6
         assert not ((np.abs(rig.seen.dq) > VELOCITY_LIMIT) & (torque * rig.seen.dq > 1e-9)).any()
-        assert (command.q >= command_limits.clip_to_command_range(command.q) - 1e-12).all()
+        assert (command.q >= command_limits.clip_to_command_range(ALIENGO, command.q) - 1e-12).all()
         if k:
             assert command.mode == before.mode
             assert np.abs(torque - asked_torque(before, rig)).max() <= 30.0 + 1e-9

@@ -26,6 +26,7 @@ from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import MotorStatus, TickInput
 from quadvel_recordings.definitions import STORE
 from quadvel_sim.simulator import Simulator, SimulatorConfig
+from tests.helpers.robots import ALIENGO
 
 TICK_MS = 5
 MUX_MS = 20
@@ -140,7 +141,9 @@ class RecordedWalk:
         prepare: Callable[[Simulator], None] | None = None,
     ) -> None:
         self.defect, self.messages = defect, Messages()
-        self.simulator = Simulator(SimulatorConfig(**{"seed": seed, **(plant or {}), **defect.plant}))
+        self.simulator = Simulator(
+            SimulatorConfig(robot=ALIENGO, **{"seed": seed, **(plant or {}), **defect.plant})
+        )
         self.simulator.reset("stand")
         if prepare is not None:
             prepare(self.simulator)

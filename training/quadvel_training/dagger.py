@@ -20,7 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from quadvel_description import robot
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_policy.observation import (
     COMMAND_AXES,
     DEFAULT_OBSERVATION,
@@ -52,6 +53,7 @@ class DaggerConfig:
     """Configuration of stage 2; a recipe file sets these fields.
 
     Attributes:
+        robot: name of a shipped robot, or path of a robot.yaml.
         budget: when the run ends.
         n: number of robots, of all processes together.
         threads: threads of the physics.
@@ -72,6 +74,7 @@ class DaggerConfig:
         randomisation: what varies between robots.
     """
 
+    robot: str = DEFAULT_ROBOT
     budget: Budget = Budget(samples=2e7, minutes=60.0)
     n: int = 512
     threads: int = attrs.field(factory=available_cores)
@@ -171,12 +174,14 @@ class DaggerRun:
         checkpoint = load(teacher_file)
         self.grid = CommandGrid(c.grid)
         self.grid.restore(checkpoint["grid"])
+        robot = load_robot(c.robot)
         env_config = EnvConfig(
+            robot=robot,
             n=c.n,
             threads=c.threads,
             seed=process_group.process_seed(c.seed),
             timestep=c.timestep,
-            actuator=load_actuator(c.actuator),
+            actuator=load_actuator(robot, c.actuator),
             terrain=c.terrain,
             randomisation=c.randomisation,
         )
@@ -408,7 +413,7 @@ def export_policy(
         action_clip=(-ACTION_BOUND, ACTION_BOUND),
         kp=(env.config.kp,) * 12,
         kd=(env.config.kd,) * 12,
-        nominal_q=tuple(robot.NOMINAL_Q),
+        nominal_q=tuple(env.robot.nominal_q),
         command_limits=dict(zip(COMMAND_AXES, zip(limits.low, limits.high, strict=True), strict=True)),
         curve_limit=limits.curve,
         state_shape=tuple(network.initial_state(1)[0].shape),

@@ -25,6 +25,7 @@ from quadvel_description.arrays import Array
 from quadvel_description.fields import field, positive
 from quadvel_description.frames import BASE, ODOM, FramePose, footprint
 from quadvel_description.kinematics import rotate
+from quadvel_description.robot import ALIENGO
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
@@ -151,7 +152,7 @@ class EstimatorNode(Node):
 
     def _publish_odometry(self, stamp: Any, state: RobotState, estimate: Estimate) -> None:
         """Publish x and y by dead reckoning and the orientation of the IMU; z is the height above the lowest foot."""
-        floor = footprint(state.q, state.quaternion)
+        floor = footprint(ALIENGO, state.q, state.quaternion)
         position = np.array([*estimate.position[:2], -rotate(state.quaternion, floor.position)[2]])
         variances = np.array([*estimate.position_deviation[:2] ** 2, HEIGHT_VARIANCE])
         message = Odometry(child_frame_id=self._settings.body_frame)

@@ -24,7 +24,7 @@ from rich.table import Table
 from typing_extensions import override
 
 from quadvel_description.onnx_format import float_value, message, serialise
-from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.robot import ALIENGO, NOMINAL_Q
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
 from quadvel_driver.board_state import BoardState
@@ -121,7 +121,7 @@ def bench_world() -> dict[str, Any]:
         Realtime factor, and time of a scan in us.
     """
     campus = World.load("campus")
-    robot = Simulator(SimulatorConfig(world=campus))
+    robot = Simulator(SimulatorConfig(robot=ALIENGO, world=campus))
     robot.reset("stand")
     command = JointCommand(q=NOMINAL_Q.copy(), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
 

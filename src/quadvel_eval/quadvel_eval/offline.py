@@ -17,6 +17,7 @@ from rich.table import Table
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.arrays import Array
 from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import ALIENGO
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
@@ -237,7 +238,7 @@ def replay_command(
       quadvel replay walk.mcap --actuator out/identify/actuator.yaml
     To see a recording in 3-D: quadvel view walk.mcap
     """
-    model = ActuatorParameters.default() if actuator is None else ActuatorParameters.load(actuator)
+    model = ActuatorParameters.of(ALIENGO) if actuator is None else ActuatorParameters.load(actuator)
     asked = LearnedEstimator(estimator_file) if estimator == "learned" else KalmanEstimator()
     output_folder(out)
     run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording))

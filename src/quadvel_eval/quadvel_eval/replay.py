@@ -18,6 +18,7 @@ from scipy.signal import savgol_filter
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import ALIENGO
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand
 from quadvel_nodes.messages import seconds
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
@@ -293,7 +294,7 @@ def open_loop_error(
         ValueError: The interval holds no complete stretch.
     """
     quiet = attrs.evolve(actuator, torque_noise=0.0)
-    simulator = Simulator(SimulatorConfig(actuator=quiet, noise=SensorNoise.none()))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, actuator=quiet, noise=SensorNoise.none()))
     errors = [
         _stretch_errors(simulator, joints, truth, row)
         for row in np.searchsorted(
@@ -374,7 +375,7 @@ def predicted_tracking(
         Command and mean velocity of each command.
     """
     setup = Setup()
-    simulator = Simulator(SimulatorConfig(actuator=actuator, seed=seed))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, actuator=actuator, seed=seed))
     simulator.reset("stand")
     supervisor = Supervisor(PolicyFile(SHIPPED_POLICY))
     loop = RobotLoop(simulator, supervisor, make_estimator(setup.estimator, simulator, setup.estimator_file))

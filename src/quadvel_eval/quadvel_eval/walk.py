@@ -19,6 +19,7 @@ from quadvel_description.arrays import Array, Bools
 from quadvel_description.fields import field
 from quadvel_description.kinematics import rotate, yaw
 from quadvel_description.quadruped import GRAVITY
+from quadvel_description.robot import ALIENGO
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
@@ -83,7 +84,9 @@ def make_simulator(setup: Setup, seed: int) -> Simulator:
     drawn = _draw_plant(rng) if setup.randomised else {}
     if setup.actuator is not None:
         drawn["actuator"] = ActuatorParameters.load(setup.actuator)
-    simulator = Simulator(SimulatorConfig(**{"terrain": terrain, "seed": seed, **drawn, **setup.plant}))
+    simulator = Simulator(
+        SimulatorConfig(**{"robot": ALIENGO, "terrain": terrain, "seed": seed, **drawn, **setup.plant})
+    )
     simulator.reset("stand")
     if setup.randomised:
         simulator.actuator.sample(rng=rng)

@@ -14,7 +14,7 @@ import numpy as np
 from quadvel_description.arrays import Array
 from quadvel_description.command_range import clip_to_command_range, split_target
 from quadvel_description.fields import positive
-from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
+from quadvel_description.robot import ALIENGO, TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 
 LIMITS = {
@@ -65,7 +65,7 @@ class JointCommandLimiter:
         if command.mode == MODE_DAMPING:
             return
         target = command.q
-        command.q, torque = split_target(target, command.kp, state.q)
+        command.q, torque = split_target(ALIENGO, target, command.kp, state.q)
         command.tau = command.tau + torque
         self._count("target_out_of_range", np.count_nonzero(command.q != target) > 0)
         requested = command.torque(state.q, state.dq)
@@ -117,6 +117,6 @@ def _add_torque(command: JointCommand, change: Array) -> None:
     The target changes as far as stiffness and range allow; feed-forward torque gives the rest.
     """
     shift = np.divide(change, command.kp, out=np.zeros(12), where=command.kp > 0.0)
-    q = np.where(shift == 0.0, command.q, clip_to_command_range(command.q + shift))
+    q = np.where(shift == 0.0, command.q, clip_to_command_range(ALIENGO, command.q + shift))
     command.tau = command.tau + change - command.kp * (q - command.q)
     command.q = q

@@ -105,7 +105,7 @@ class Scene:
             self._base.position, self._base.wxyz = (0.0, 0.0, height), picture.quaternion
             self._world.position = (-x, -y, -self._floor - robot.NOMINAL_HEIGHT)
             self._grid.position = (-x % 1.0, -y % 1.0, -robot.NOMINAL_HEIGHT)
-            for placed in moving_links(picture.q):
+            for placed in moving_links(robot.ALIENGO, picture.q):
                 self._links[placed.child].wxyz = placed.quaternion
             self._draw_world(picture)
 

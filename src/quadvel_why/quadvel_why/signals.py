@@ -11,6 +11,7 @@ import numpy as np
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.arrays import Array, Bools
+from quadvel_description.robot import ALIENGO
 from quadvel_description.state import RobotState
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
@@ -64,7 +65,7 @@ class Trained:
         """
         recipe = policy.metadata.recipe if isinstance(policy.metadata.recipe, dict) else {}
         ranges = recipe.get("configuration", {}).get("randomisation", {})
-        drives = ActuatorParameters.default()
+        drives = ActuatorParameters.of(ALIENGO)
         longest = max(p.input_delay_s + p.output_delay_s for p in drives.probable_pairs)
         kp, kd = np.mean(drives.delta_kp), np.mean(drives.delta_kd)
         return cls(

@@ -10,7 +10,7 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Array
-from quadvel_description.robot import LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
+from quadvel_description.robot import ALIENGO, LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
@@ -148,7 +148,7 @@ def run_case(case: Case, seed: int) -> FaultRun:
 
 def _prepare_stack(mode: str, rng: np.random.Generator, seed: int) -> Stack:
     """Bring a robot to a random instant of a mode."""
-    simulator = Simulator(SimulatorConfig(seed=seed))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, seed=seed))
     simulator.reset("lie" if mode == "stand_up" else "stand")
     policy, estimator = _networks()
     policy.reset()

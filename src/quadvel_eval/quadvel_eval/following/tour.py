@@ -17,6 +17,7 @@ import numpy as np
 
 from quadvel_description.arrays import Array
 from quadvel_description.kinematics import rotate, yaw
+from quadvel_description.robot import ALIENGO
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL
 from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, Plan, State
@@ -109,7 +110,9 @@ class Tour:
 
     def __init__(self, setup: TourSetup) -> None:
         self.setup, self.world = setup, World.load(setup.world)
-        self.simulator = Simulator(SimulatorConfig(world=self.world, seed=setup.seed, **setup.plant))
+        self.simulator = Simulator(
+            SimulatorConfig(robot=ALIENGO, world=self.world, seed=setup.seed, **setup.plant)
+        )
         self.simulator.reset("stand")
         supervisor = Supervisor(PolicyFile(setup.policy), backup=KalmanEstimator())
         estimator = make_estimator(setup.estimator, self.simulator, setup.estimator_file)
