@@ -20,6 +20,7 @@ class StandingPolicy:
 
     def __init__(self) -> None:
         self.metadata = PolicyMetadata(
+            robot="aliengo",
             action_offset=tuple(robot.NOMINAL_Q + mjcf.gravity_torque(mjcf.load_model()) / robot.KP),
             action_scale=1.0,
             kp=robot.KP,

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from quadvel_description import robot
+from quadvel_description.robot_name import UNNAMED_ROBOT
 from quadvel_policy.observation import (
     COMMAND_AXES,
     DEFAULT_OBSERVATION,
@@ -403,6 +404,7 @@ def export_policy(
         about: how the policy was trained, for the metadata.
     """
     metadata = PolicyMetadata(
+        robot=UNNAMED_ROBOT,
         action_offset=tuple(env.stand_q),
         action_scale=(ACTION_SCALE,) * 12,
         action_clip=(-ACTION_BOUND, ACTION_BOUND),
