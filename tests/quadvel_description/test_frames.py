@@ -9,6 +9,8 @@ import pytest
 from quadvel_description import mjcf, robot
 from quadvel_description.frames import BASE, FOOTPRINT, FramePose, fixed_links, footprint, moving_links
 from quadvel_description.kinematics import foot_positions, rotate, yaw
+from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import ALIENGO
 
 
 def in_base(frames: list[FramePose], name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -47,7 +49,7 @@ def test_links_are_where_mujoco_has_them() -> None:
         data.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *q]
         mujoco.mj_kinematics(model, data)
         frames = [*fixed_links(), *moving_links(q)]
-        for joint in robot.JOINT_NAMES:
+        for joint in JOINT_NAMES:
             body = joint.removesuffix("_joint")
             position, rotation = in_base(frames, body)
             np.testing.assert_allclose(position, data.body(body).xpos, atol=1e-12)
@@ -66,5 +68,5 @@ def test_the_footprint_is_level_below_the_robot_where_its_lowest_foot_touches(
     in_world = trunk_matrix.reshape(3, 3) @ rotation
     c, s = np.cos(yaw(trunk)), np.sin(yaw(trunk))
     np.testing.assert_allclose(in_world, [[c, -s, 0], [s, c, 0], [0, 0, 1]], atol=1e-12)
-    lowest = rotate(trunk, foot_positions(q))[:, 2].min() - robot.FOOT_RADIUS
+    lowest = rotate(trunk, foot_positions(ALIENGO, q))[:, 2].min() - robot.FOOT_RADIUS
     np.testing.assert_allclose(rotate(trunk, position), [0.0, 0.0, lowest], atol=1e-12)

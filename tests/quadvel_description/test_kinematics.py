@@ -6,6 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from quadvel_description import kinematics, mjcf, robot
+from quadvel_description.quadruped import LEGS
+from quadvel_description.robot import ALIENGO
 
 
 def _random_q(count: int, seed: int) -> np.ndarray:
@@ -34,8 +36,8 @@ def test_foot_positions_are_those_of_mujoco():
     for q in _random_q(50, 0):
         data.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *q]
         mujoco.mj_kinematics(model, data)
-        feet = [data.geom(f"{leg}_foot").xpos for leg in robot.LEGS]
-        np.testing.assert_allclose(kinematics.foot_positions(q), feet, atol=1e-12)
+        feet = [data.geom(f"{leg}_foot").xpos for leg in LEGS]
+        np.testing.assert_allclose(kinematics.foot_positions(ALIENGO, q), feet, atol=1e-12)
 
 
 def test_foot_jacobians_are_the_derivatives_of_the_positions():
@@ -44,38 +46,42 @@ def test_foot_jacobians_are_the_derivatives_of_the_positions():
         numeric = np.zeros((4, 3, 3))
         for i in range(12):
             change = np.eye(12)[i] * step
-            slope = kinematics.foot_positions(q + change) - kinematics.foot_positions(q - change)
+            slope = kinematics.foot_positions(ALIENGO, q + change) - kinematics.foot_positions(
+                ALIENGO, q - change
+            )
             numeric[i // 3, :, i % 3] = slope[i // 3] / (2 * step)
-        np.testing.assert_allclose(kinematics.foot_jacobians(q), numeric, atol=1e-9)
+        np.testing.assert_allclose(kinematics.foot_jacobians(ALIENGO, q), numeric, atol=1e-9)
 
 
 def test_inverse_kinematics_undoes_the_forward_one():
     q = _standing_q(500, 2)
     assert len(q) > 100
-    np.testing.assert_allclose(kinematics.inverse_kinematics(kinematics.foot_positions(q)), q, atol=1e-6)
+    np.testing.assert_allclose(
+        kinematics.inverse_kinematics(ALIENGO, kinematics.foot_positions(ALIENGO, q)), q, atol=1e-6
+    )
 
 
 def test_a_foot_out_of_reach_is_placed_in_its_direction_on_a_straight_leg():
-    feet = kinematics.foot_positions(robot.NOMINAL_Q)
+    feet = kinematics.foot_positions(ALIENGO, robot.NOMINAL_Q)
     far = feet - np.array([0.0, 0.0, 1.0])
-    reached = kinematics.foot_positions(kinematics.inverse_kinematics(far))
+    reached = kinematics.foot_positions(ALIENGO, kinematics.inverse_kinematics(ALIENGO, far))
     assert np.isfinite(reached).all()
     np.testing.assert_allclose(reached, np.column_stack([feet[:, :2], np.full(4, -0.5)]), atol=1e-6)
 
 
 def test_the_stance_has_its_feet_below_the_hips():
-    feet = kinematics.foot_positions(robot.NOMINAL_Q)
+    feet = kinematics.foot_positions(ALIENGO, robot.NOMINAL_Q)
     np.testing.assert_allclose(feet[:, 2], robot.FOOT_RADIUS - robot.NOMINAL_HEIGHT, atol=1e-4)
-    np.testing.assert_allclose(feet[:, 0], kinematics.HIPS[:, 0], atol=1e-4)
+    np.testing.assert_allclose(feet[:, 0], ALIENGO.legs.hips[:, 0], atol=1e-4)
 
 
 def test_leading_axes_are_kept():
     q = _standing_q(500, 3)[:6].reshape(2, 3, 12)
-    feet = kinematics.foot_positions(q)
+    feet = kinematics.foot_positions(ALIENGO, q)
     assert feet.shape == (2, 3, 4, 3)
-    assert kinematics.foot_jacobians(q).shape == (2, 3, 4, 3, 3)
+    assert kinematics.foot_jacobians(ALIENGO, q).shape == (2, 3, 4, 3, 3)
     np.testing.assert_array_equal(
-        kinematics.inverse_kinematics(feet)[1, 2], kinematics.inverse_kinematics(feet[1, 2])
+        kinematics.inverse_kinematics(ALIENGO, feet)[1, 2], kinematics.inverse_kinematics(ALIENGO, feet[1, 2])
     )
     quaternions = _wxyz(_random_rotations(6, 4)).reshape(2, 3, 4)
     quaternions /= np.linalg.norm(quaternions, axis=-1, keepdims=True)

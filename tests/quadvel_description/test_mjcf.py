@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from quadvel_description import kinematics, mjcf, robot
+from quadvel_description.quadruped import GRAVITY, JOINT_NAMES, LEGS
+from quadvel_description.robot import ALIENGO
 
 
 def _in(model: mujoco.MjModel, keyframe: str) -> mujoco.MjData:
@@ -19,7 +21,7 @@ def test_in_a_keyframe_the_feet_touch_the_ground_and_nothing_reaches_below_it(ke
     model = mjcf.load_model()
     data = _in(model, keyframe)
     np.testing.assert_array_equal(data.qpos[7:], q)
-    soles = [data.geom(f"{leg}_foot").xpos[2] - robot.FOOT_RADIUS for leg in robot.LEGS]
+    soles = [data.geom(f"{leg}_foot").xpos[2] - robot.FOOT_RADIUS for leg in LEGS]
     np.testing.assert_allclose(soles, 0.0, atol=5e-4)
     assert (data.contact.dist > -5e-4).all()
     assert all(model.geom(geom).name.endswith("_foot") for geom in data.contact.geom2)
@@ -41,12 +43,12 @@ def test_the_robot_stands_on_its_gains_and_the_torque_against_gravity():
 
 def test_the_torque_against_gravity_carries_the_weight_of_the_trunk_on_the_feet():
     model = mjcf.load_model()
-    feet = kinematics.foot_jacobians(robot.NOMINAL_Q)
+    feet = kinematics.foot_jacobians(ALIENGO, robot.NOMINAL_Q)
     data = _in(model, "stand")
     legs = data.qfrc_bias[6:].reshape(4, 3)  # the legs' weight on a fixed trunk
     torque = mjcf.gravity_torque(model).reshape(4, 3)
     force = np.linalg.solve(np.swapaxes(feet, 1, 2), (legs - torque)[..., None])[..., 0]
-    np.testing.assert_allclose(force, np.tile([0, 0, robot.MASS * robot.GRAVITY / 4], (4, 1)), atol=1e-6)
+    np.testing.assert_allclose(force, np.tile([0, 0, robot.MASS * GRAVITY / 4], (4, 1)), atol=1e-6)
 
 
 def test_the_lying_robot_sinks_on_its_belly_upright_and_rests():
@@ -62,7 +64,7 @@ def test_the_lying_robot_sinks_on_its_belly_upright_and_rests():
 
 def test_motors_stand_in_the_order_of_the_joint_table_and_keep_its_limits():
     model = mjcf.load_model()
-    assert [model.actuator(i).name for i in range(model.nu)] == list(robot.JOINT_NAMES)
+    assert [model.actuator(i).name for i in range(model.nu)] == list(JOINT_NAMES)
     np.testing.assert_array_equal(
         model.actuator_ctrlrange, np.stack([-robot.TORQUE_LIMIT, robot.TORQUE_LIMIT], 1)
     )
@@ -81,7 +83,7 @@ def test_the_plant_varies_the_robot():
 def test_without_leg_shapes_only_feet_and_trunk_collide():
     model = mjcf.load_model(mjcf.Plant(only_feet_and_trunk=True))
     colliding = {model.geom(i).name for i in range(model.ngeom) if model.geom_conaffinity[i]}
-    assert colliding == {"trunk", *(f"{leg}_foot" for leg in robot.LEGS)}
+    assert colliding == {"trunk", *(f"{leg}_foot" for leg in LEGS)}
 
 
 def test_the_imu_of_a_robot_at_rest_feels_gravity():
@@ -90,6 +92,6 @@ def test_the_imu_of_a_robot_at_rest_feels_gravity():
     for _ in range(2500):
         data.ctrl[:] = -2.0 * data.qvel[6:]
         mujoco.mj_step(model, data)
-    np.testing.assert_allclose(data.sensor("accelerometer").data, [0, 0, robot.GRAVITY], atol=0.05)
+    np.testing.assert_allclose(data.sensor("accelerometer").data, [0, 0, GRAVITY], atol=0.05)
     np.testing.assert_allclose(data.sensor("gyro").data, 0.0, atol=0.01)
     np.testing.assert_allclose(data.sensor("orientation").data, data.qpos[3:7], atol=1e-3)

@@ -15,8 +15,8 @@ from onnx import ModelProto, TensorProto, helper, numpy_helper
 
 from quadvel_description.network_file import NetworkFileError, read_network
 from quadvel_description.onnx_format import serialise
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.recurrent_network import RecurrentNetwork
-from quadvel_description.robot import JOINT_NAMES
 
 Change = Callable[[ModelProto], object]
 

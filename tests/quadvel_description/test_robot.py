@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from quadvel_description import robot
+from quadvel_description.quadruped import JOINT_NAMES, joint_index
 
 # mass (kg), centre of mass (m) and inertia (ixx iyy izz ixy ixz iyz, kg mm^2), worked out apart
 LUMPED = {
@@ -51,15 +52,15 @@ def test_every_inertia_is_that_of_a_real_body():
 
 
 def test_joints_stand_in_the_order_of_the_robot():
-    assert robot.JOINT_NAMES[:4] == ("FR_hip_joint", "FR_thigh_joint", "FR_calf_joint", "FL_hip_joint")
-    assert [name[:2] for name in robot.JOINT_NAMES[::3]] == ["FR", "FL", "RR", "RL"]
-    assert robot.joint_index(robot.JOINT_NAMES) == list(range(12))
-    assert robot.joint_index(["RL_calf", "FR_hip_joint"]) == [11, 0]
+    assert JOINT_NAMES[:4] == ("FR_hip_joint", "FR_thigh_joint", "FR_calf_joint", "FL_hip_joint")
+    assert [name[:2] for name in JOINT_NAMES[::3]] == ["FR", "FL", "RR", "RL"]
+    assert joint_index(JOINT_NAMES) == list(range(12))
+    assert joint_index(["RL_calf", "FR_hip_joint"]) == [11, 0]
 
 
 def test_an_unknown_joint_is_refused_by_name():
     with pytest.raises(ValueError, match="found 'FR_knee', expected one of FR_hip_joint"):
-        robot.joint_index(["FR_hip", "FR_knee"])
+        joint_index(["FR_hip", "FR_knee"])
 
 
 def test_postures_and_commands_lie_within_the_mechanical_range():
@@ -69,7 +70,7 @@ def test_postures_and_commands_lie_within_the_mechanical_range():
 
 
 def test_hips_may_be_commanded_further_outward_than_inward():
-    hips = robot.joint_index(["FR_hip", "FL_hip"])  # positive: right foot inward, left foot outward
+    hips = joint_index(["FR_hip", "FL_hip"])  # positive: right foot inward, left foot outward
     np.testing.assert_array_equal(robot.COMMAND_LOWER[hips], [-1.047, -0.873])
     np.testing.assert_array_equal(robot.COMMAND_UPPER[hips], [0.873, 1.047])
 

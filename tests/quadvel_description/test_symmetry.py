@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from quadvel_description import kinematics, mjcf, robot, symmetry
+from quadvel_description.quadruped import LEGS
+from quadvel_description.robot import ALIENGO
 
 MIRROR = np.array([1.0, -1.0, 1.0])  # across the sagittal plane
 OPPOSITE = {"FR": "FL", "FL": "FR", "RR": "RL", "RL": "RR"}
@@ -69,8 +71,8 @@ def test_a_mirrored_command_turns_and_steps_the_other_way():
 
 def test_mirrored_joints_put_the_feet_at_mirrored_places():
     q = np.random.default_rng(1).uniform(robot.LOWER, robot.UPPER, size=(20, 12))
-    feet = kinematics.foot_positions(q)
-    mirrored = kinematics.foot_positions(symmetry.mirror_joints(q))
+    feet = kinematics.foot_positions(ALIENGO, q)
+    mirrored = kinematics.foot_positions(ALIENGO, symmetry.mirror_joints(q))
     np.testing.assert_allclose(mirrored, feet[:, symmetry.FEET.index] * MIRROR, atol=1e-12)
 
 
@@ -87,7 +89,7 @@ def test_only_trunk_and_calves_are_a_little_asymmetric():
     model, mirrored = mjcf.load_model(plant), _mirrored_model(plant)
     shift = np.abs(model.body_ipos - mirrored.body_ipos).max(axis=1)
     moved = {model.body(i).name for i in np.flatnonzero(shift > 1e-9)}
-    assert moved == {"trunk", *(f"{leg}_calf" for leg in robot.LEGS)}
+    assert moved == {"trunk", *(f"{leg}_calf" for leg in LEGS)}
     assert shift.max() < 0.008  # m, twice the lateral offset of the trunk's centre of mass
 
 

@@ -8,7 +8,8 @@ import pytest
 
 from quadvel_description import kinematics, mjcf, robot
 from quadvel_description.frames import BASE
-from quadvel_description.urdf import urdf
+from quadvel_description.quadruped import JOINT_NAMES, LEGS
+from quadvel_description.robot import ALIENGO, load_robot
 from quadvel_description.urdf_generator import generate_urdf
 
 KEEP_FIXED_LINKS = '<mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
@@ -16,7 +17,9 @@ KEEP_FIXED_LINKS = '<mujoco><compiler fusestatic="false" discardvisual="false"/>
 
 @pytest.fixture(scope="module")
 def imported() -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_string(urdf().replace("</robot>", f"{KEEP_FIXED_LINKS}</robot>"))
+    return mujoco.MjModel.from_xml_string(
+        ALIENGO.urdf_file.read_text().replace("</robot>", f"{KEEP_FIXED_LINKS}</robot>")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +31,7 @@ def _postures(imported: mujoco.MjModel, simulated: mujoco.MjModel, count: int):
     """Postures, and the URDF's and the MJCF's MjData in them, with the trunk at the origin."""
     first, second = mujoco.MjData(imported), mujoco.MjData(simulated)
     for q in np.random.default_rng(0).uniform(robot.LOWER, robot.UPPER, size=(count, 12)):
-        for name, angle in zip(robot.JOINT_NAMES, q, strict=True):
+        for name, angle in zip(JOINT_NAMES, q, strict=True):
             first.joint(name).qpos = angle
         second.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *q]
         for model, data in ((imported, first), (simulated, second)):
@@ -48,7 +51,7 @@ def test_urdf_and_mjcf_have_the_same_centre_of_mass(imported, simulated):
 
 
 def test_urdf_and_mjcf_have_the_same_inertia_about_every_joint(imported, simulated):
-    rows = [imported.joint(name).dofadr[0] for name in robot.JOINT_NAMES]
+    rows = [imported.joint(name).dofadr[0] for name in JOINT_NAMES]
     for _, first, second in _postures(imported, simulated, 5):
         inertia = []
         for model, data in ((imported, first), (simulated, second)):
@@ -61,7 +64,7 @@ def test_urdf_and_mjcf_have_the_same_inertia_about_every_joint(imported, simulat
 
 def test_urdf_and_mjcf_put_every_foot_at_the_same_place(imported, simulated):
     for q, first, second in _postures(imported, simulated, 50):
-        for leg, foot in zip(robot.LEGS, kinematics.foot_positions(q), strict=True):
+        for leg, foot in zip(LEGS, kinematics.foot_positions(ALIENGO, q), strict=True):
             np.testing.assert_allclose(
                 first.body(f"{leg}_foot").xpos, second.geom(f"{leg}_foot").xpos, atol=1e-9
             )
@@ -84,15 +87,18 @@ def test_urdf_and_mjcf_show_the_same_shapes(imported, simulated):
 
 
 def test_limits_in_the_urdf_are_those_of_the_joint_table():
-    joints = {joint.get("name"): joint for joint in ElementTree.fromstring(urdf()).iter("joint")}
-    for i, name in enumerate(robot.JOINT_NAMES):
+    joints = {
+        joint.get("name"): joint
+        for joint in ElementTree.fromstring(ALIENGO.urdf_file.read_text()).iter("joint")
+    }
+    for i, name in enumerate(JOINT_NAMES):
         limit = joints[name].find("limit")
         found = [float(limit.get(key)) for key in ("lower", "upper", "effort", "velocity")]
         assert found == [robot.LOWER[i], robot.UPPER[i], robot.TORQUE_LIMIT[i], robot.VELOCITY_LIMIT[i]]
 
 
 def test_links_form_one_tree_below_a_root_without_inertia():
-    tree = ElementTree.fromstring(urdf())
+    tree = ElementTree.fromstring(ALIENGO.urdf_file.read_text())
     links = [link.get("name") for link in tree.iter("link")]
     children = [joint.find("child").get("link") for joint in tree.iter("joint")]
     parents = [joint.find("parent").get("link") for joint in tree.iter("joint")]
@@ -102,5 +108,8 @@ def test_links_form_one_tree_below_a_root_without_inertia():
     assert tree.find(f"link[@name='{BASE}']/inertial") is None
 
 
-def test_the_file_is_the_generated_urdf():
-    assert urdf() == generate_urdf(), "write it again: python -m quadvel_description.urdf_generator"
+def test_the_urdf_of_the_go2_is_the_generated_one():
+    go2 = load_robot("go2")
+    assert go2.urdf_file.read_text() == generate_urdf(go2.folder), (
+        "python -m quadvel_description.urdf_generator"
+    )

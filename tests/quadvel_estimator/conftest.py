@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 import quadvel_dds
-from quadvel_description.robot import GRAVITY, NOMINAL_Q
+from quadvel_description.quadruped import GRAVITY
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_estimator import features
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from quadvel_description.network_input import InputLayout
-from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
+from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_estimator import features
 

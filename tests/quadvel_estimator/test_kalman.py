@@ -8,13 +8,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from quadvel_description.kinematics import foot_jacobians, foot_positions, inverse_kinematics, rotation_matrix
-from quadvel_description.robot import FOOT_RADIUS, GRAVITY, MASS, NOMINAL_HEIGHT, NOMINAL_Q
+from quadvel_description.quadruped import GRAVITY
+from quadvel_description.robot import ALIENGO, FOOT_RADIUS, MASS, NOMINAL_HEIGHT, NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator, _ground_force
 from quadvel_estimator.odometry import leg_velocity
 
 DT = 0.005
-NOMINAL_FEET = foot_positions(NOMINAL_Q)
+NOMINAL_FEET = foot_positions(ALIENGO, NOMINAL_Q)
 CONFIG = KalmanConfig(
     accelerometer=1.0,
     foot_position=0.003,
@@ -39,7 +40,7 @@ def rolling_stance(speed: float, time: np.ndarray) -> np.ndarray:
     for _ in range(10):
         turn = q[:, 1::3] + q[:, 2::3] - NOMINAL_Q[1] - NOMINAL_Q[2]
         feet[..., 0] = NOMINAL_FEET[:, 0] - speed * time[:, None] + FOOT_RADIUS * turn
-        q = inverse_kinematics(feet)
+        q = inverse_kinematics(ALIENGO, feet)
     return q
 
 
@@ -124,10 +125,10 @@ def test_one_foot_that_slips_is_not_believed(standing: State) -> None:
     def state(time: float) -> RobotState:
         feet = NOMINAL_FEET.copy()
         feet[0, 0] += slide * time
-        q = inverse_kinematics(feet)
+        q = inverse_kinematics(ALIENGO, feet)
         foot_rate = np.zeros((4, 3, 1))
         foot_rate[0, 0] = slide
-        dq = np.linalg.solve(foot_jacobians(q), foot_rate).reshape(12)
+        dq = np.linalg.solve(foot_jacobians(ALIENGO, q), foot_rate).reshape(12)
         return standing(time, q=q, dq=dq)
 
     estimator = KalmanEstimator(CONFIG)
@@ -155,7 +156,7 @@ def test_each_leg_tells_the_velocity_that_lets_its_contact_point_rest(standing: 
         def contact(h: float, leg: int = leg, fixed: np.ndarray = fixed_in_calf) -> np.ndarray:
             moved = q + h * dq
             turned = attitude * Rotation.from_rotvec(h * omega)
-            return turned.apply(foot_positions(moved)[leg] + calf(moved, leg).apply(fixed))
+            return turned.apply(foot_positions(ALIENGO, moved)[leg] + calf(moved, leg).apply(fixed))
 
         slide = (contact(1e-6) - contact(-1e-6)) / 2e-6  # world frame, while the trunk's origin stays
         np.testing.assert_allclose(attitude.apply(velocity_by_leg[leg]), -slide, atol=1e-7)
@@ -169,14 +170,16 @@ def test_joint_torques_tell_the_weight_on_each_foot() -> None:
     share = np.array([0.4, 0.1, 0.2, 0.3]) * MASS * GRAVITY
     force = np.column_stack([rng.normal(0.0, 20.0, (4, 2)), share])  # on the feet, world frame
     power = 1e-6 * np.eye(12)  # virtual displacements of the joints do the work of the forces on the feet
-    shifts = (foot_positions(q + power) - foot_positions(q - power)) / 2e-6  # (12, 4, 3), trunk frame
+    shifts = (
+        foot_positions(ALIENGO, q + power) - foot_positions(ALIENGO, q - power)
+    ) / 2e-6  # (12, 4, 3), trunk frame
     tau = -np.einsum("jfi,ki,fk->j", shifts, rotation, force)
-    np.testing.assert_allclose(_ground_force(tau, rotation, foot_jacobians(q)), share, rtol=0.02)
+    np.testing.assert_allclose(_ground_force(tau, rotation, foot_jacobians(ALIENGO, q)), share, rtol=0.02)
 
 
 def test_standing_on_torques_alone_works_without_foot_sensors(standing: State) -> None:
     load = np.array([0.0, 0.0, MASS * GRAVITY / 4])
-    tau = -np.einsum("fij,i->fj", foot_jacobians(NOMINAL_Q), load).reshape(12)
+    tau = -np.einsum("fij,i->fj", foot_jacobians(ALIENGO, NOMINAL_Q), load).reshape(12)
     config = attrs.evolve(CONFIG, contact_source="torque")
     estimator = KalmanEstimator(config)
     states = [standing(DT * i, tau=tau, foot_force=np.zeros(4)) for i in range(100)]

@@ -4,7 +4,7 @@ import attrs
 import numpy as np
 import pytest
 
-from quadvel_description import robot
+from quadvel_description.quadruped import LEFT, LEGS
 from quadvel_description.symmetry import JOINTS as MIRROR
 from quadvel_eval.paper.symmetry import PHASES_PER_CYCLE, Symmetry, leg_curves, resample_cycles
 from quadvel_eval.walk import Walk
@@ -18,9 +18,9 @@ def trot(right: float = 1.0) -> Walk:
     phase = FREQUENCY * PERIOD * np.arange(N)
     legs = phase[:, None] + np.array([0.5, 0.0, 0.0, 0.5])  # FR FL RR RL
     curves = np.sin(2 * np.pi * legs)[:, :, None] * np.array([2.0, 5.0, 9.0]) + np.array([1.0, 0.0, 3.0])
-    torque = curves * np.where([robot.LEFT[leg] > 0 for leg in robot.LEGS], 1.0, right)[:, None]
+    torque = curves * np.where([LEFT[leg] > 0 for leg in LEGS], 1.0, right)[:, None]
     joints = torque.reshape(N, 12)
-    sides = np.where(np.repeat([robot.LEFT[leg] > 0 for leg in robot.LEGS], 3), 1.0, MIRROR.sign)
+    sides = np.where(np.repeat([LEFT[leg] > 0 for leg in LEGS], 3), 1.0, MIRROR.sign)
     return Walk(
         time=np.arange(N) * PERIOD,
         position=np.zeros((N, 3)),

@@ -12,7 +12,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_eval.offline import replay_command
 from quadvel_eval.recording_plot import plot_command, read_recorded_run
 from quadvel_recordings.definitions import STORE

@@ -10,8 +10,10 @@ import pytest
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_description import robot
-from quadvel_description.kinematics import HIPS, foot_positions, roll_pitch
+from quadvel_description.kinematics import foot_positions, roll_pitch
 from quadvel_description.mjcf import Plant, load_model
+from quadvel_description.quadruped import GRAVITY, JOINT_NAMES
+from quadvel_description.robot import ALIENGO
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_lab.excite import MotionPlayer
 from quadvel_sim.simulator import Simulator, SimulatorConfig
@@ -95,7 +97,9 @@ def other_plant(seed: int) -> tuple[RobotState, Body]:
 def test_foot_lifting_goes_through_on_the_ground(seed: int) -> None:
     states, _ = play(FootLifting(), *simulated(seed))
     assert largest_tilt(states) < LEVEL
-    height = np.array([foot_positions(state.q) - HIPS for state in states[2500:]])[:, :, 2]
+    height = np.array([foot_positions(ALIENGO, state.q) - ALIENGO.legs.hips for state in states[2500:]])[
+        :, :, 2
+    ]
     np.testing.assert_allclose(
         height.min(axis=0), -0.4, atol=0.02
     )  # Eq. 9: below the hip, and 0.1 m above that
@@ -124,7 +128,7 @@ def test_the_feet_carry_the_robots_weight_and_a_lifted_foot_nothing() -> None:
     mujoco.mj_forward(model, data)
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jac(model, data, jacobian, None, data.geom("FR_foot").xpos, model.body("FR_calf").id)
-    quarter = robot.MASS * robot.GRAVITY / 4
+    quarter = robot.MASS * GRAVITY / 4
     np.testing.assert_allclose(torque[0][:3], -quarter * jacobian[2, 6:9], atol=1e-4)
     np.testing.assert_allclose(
         torque[125][[0, 1, 2, 9, 10, 11]], 0.0, atol=1e-9
@@ -154,7 +158,7 @@ def test_the_log_of_foot_lifting_gives_the_gains_and_delays_of_the_drives() -> N
     t = PERIOD_S * np.arange(len(states))
     log = Log(
         name="lift",
-        joints=robot.JOINT_NAMES,
+        joints=JOINT_NAMES,
         t=t,
         **state,
         valid=np.ones((len(t), 12), bool),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quadvel_description.kinematics import foot_positions, rotate
-from quadvel_description.robot import LIE_Q, NOMINAL_Q
+from quadvel_description.robot import ALIENGO, LIE_Q, NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_policy.modes import ModeInput, Posture, blend, vertical_offset
 
@@ -79,7 +79,7 @@ def test_on_a_slope_a_posture_keeps_the_feet_below_the_trunk(axis: tuple[float, 
     state = tick_at(0.0, NOMINAL_Q, JointCommand.damping()).state
     state.quaternion = np.array([np.cos(tilt / 2), *(np.sin(tilt / 2) * np.array(axis)), 0.0])
     posture = Posture([(1.0, NOMINAL_Q)], kp=100.0, kd=3.0)
-    feet = foot_positions(posture.final_posture(state))
+    feet = foot_positions(ALIENGO, posture.final_posture(state))
     np.testing.assert_allclose(feet[:, 2], -0.4, atol=1e-4)  # no leg shorter than before
     middle = rotate(state.quaternion, feet.mean(axis=0))
     np.testing.assert_allclose(middle[:2], 0.0, atol=1e-9)

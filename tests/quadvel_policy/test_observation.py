@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
+from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.symmetry import mirror_observation
 from quadvel_policy.observation import (
     DEFAULT_OBSERVATION,

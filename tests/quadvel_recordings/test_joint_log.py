@@ -14,7 +14,7 @@ import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_recordings import bounds
 from quadvel_recordings.definitions import STORE
 from quadvel_recordings.joint_log import LEG_JOINTS, JointLog, read_joint_log, require_commands

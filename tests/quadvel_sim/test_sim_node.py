@@ -10,6 +10,7 @@ import pytest
 from geometry_msgs.msg import Vector3, Wrench
 
 from quadvel_description import robot
+from quadvel_description.quadruped import GRAVITY, JOINT_NAMES
 from quadvel_description.state import JointCommand
 from quadvel_nodes.messages import seconds
 
@@ -44,12 +45,12 @@ def test_lockstep_waits_for_answers_and_tells_the_time(start: Start, peer: Any) 
     assert (odom.header.frame_id, odom.child_frame_id) == ("odom", "base_link")
     assert odom.pose.pose.position.z == pytest.approx(robot.NOMINAL_HEIGHT, abs=0.03)
     joints = peer.heard["joint_states"][-1]
-    assert list(joints.name) == list(robot.JOINT_NAMES)
+    assert list(joints.name) == list(JOINT_NAMES)
     assert len(joints.position) == len(joints.velocity) == len(joints.effort) == 12
-    assert peer.heard["imu"][-1].linear_acceleration.z == pytest.approx(robot.GRAVITY, abs=2.0)
+    assert peer.heard["imu"][-1].linear_acceleration.z == pytest.approx(GRAVITY, abs=2.0)
     links = {transform.child_frame_id for message in peer.heard["/tf"] for transform in message.transforms}
     assert links == {
-        name.removesuffix("_joint") for name in robot.JOINT_NAMES
+        name.removesuffix("_joint") for name in JOINT_NAMES
     }  # the estimator publishes the pose of the trunk
 
 
@@ -103,7 +104,7 @@ def test_the_services_reset_pause_step_and_push(start: Start, peer: Any) -> None
     assert peer.call("pause", data=True).success
     peer.spin(0.2)
     count, tick = len(states), states[-1].tick
-    force = Wrench(force=Vector3(x=0.0, y=0.0, z=40.0 * robot.MASS * robot.GRAVITY))
+    force = Wrench(force=Vector3(x=0.0, y=0.0, z=40.0 * robot.MASS * GRAVITY))
     assert peer.call("push", wrench=force, duration=0.01).success
     peer.answer = answer
     assert peer.call("step", steps=12).success

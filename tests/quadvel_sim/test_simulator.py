@@ -12,11 +12,13 @@ from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_description import robot
 from quadvel_description.kinematics import foot_positions, rotate, rotate_inverse
 from quadvel_description.mjcf import gravity_torque
+from quadvel_description.quadruped import GRAVITY, LEGS
+from quadvel_description.robot import ALIENGO
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_sim.simulator import DT, SensorNoise, Simulator, SimulatorConfig
 from quadvel_sim.terrain import Terrain
 
-G = robot.GRAVITY
+G = GRAVITY
 
 
 def simulator(**fields: object) -> Simulator:
@@ -154,7 +156,7 @@ def test_reset_puts_the_robot_at_rest_with_its_feet_on_the_ground(keyframe: str)
     state, truth = sim.state(), sim.truth()
     assert (sim.time, state.time, state.tick, sim.braking) == (0.0, 0.0, 0, True)
     np.testing.assert_array_equal(state.dq, 0.0)
-    feet = truth.position + foot_positions(state.q)
+    feet = truth.position + foot_positions(ALIENGO, state.q)
     np.testing.assert_allclose(feet[:, 2], robot.FOOT_RADIUS, atol=2e-3)
     assert not sim.data.xfrc_applied.any()
 
@@ -207,13 +209,13 @@ def test_feet_do_not_creep_where_friction_holds_them() -> None:
     feet = []
     for seconds in (0.5, 1.0):
         run(sim, stiff, seconds)
-        feet.append([sim.data.geom(f"{leg}_foot").xpos.copy() for leg in robot.LEGS])
+        feet.append([sim.data.geom(f"{leg}_foot").xpos.copy() for leg in LEGS])
     assert np.linalg.norm(np.subtract(*feet), axis=1).max() < 0.002
 
 
 def test_each_foot_has_its_own_friction() -> None:
     sim = simulator(friction=[0.1, 0.2, 0.3, 0.4])
-    assert [sim.model.geom(f"{leg}_foot").friction[0] for leg in robot.LEGS] == [0.1, 0.2, 0.3, 0.4]
+    assert [sim.model.geom(f"{leg}_foot").friction[0] for leg in LEGS] == [0.1, 0.2, 0.3, 0.4]
 
 
 @pytest.mark.parametrize(
@@ -229,7 +231,7 @@ def test_the_robot_stands_along_the_slope_on_its_ground(terrain: Terrain) -> Non
         rotate(terrain.tilt, np.array([0, 0, 1.0])),
     )
     assert up @ ground_up > np.cos(0.03)
-    feet = truth.position + rotate(truth.quaternion, foot_positions(state.q))
+    feet = truth.position + rotate(truth.quaternion, foot_positions(ALIENGO, state.q))
     gaps = (feet[:, 2] - terrain.height(feet[:, 0], feet[:, 1])) * np.cos(terrain.slope)
     np.testing.assert_allclose(gaps, robot.FOOT_RADIUS, atol=2e-3)
     assert truth.contact.all()

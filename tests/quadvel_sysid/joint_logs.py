@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from mcap.writer import Writer
 
-from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
+from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_recordings.definitions import STORE
 
 KP, KD = 30.0, 0.5

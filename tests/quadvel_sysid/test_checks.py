@@ -11,7 +11,8 @@ import attrs
 import numpy as np
 import pytest
 
-from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
+from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_sysid.logs.check_log import CheckedLog, check_log
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log

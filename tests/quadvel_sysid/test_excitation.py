@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from quadvel_description import robot
-from quadvel_description.kinematics import HIPS, foot_positions
+from quadvel_description.kinematics import foot_positions
+from quadvel_description.robot import ALIENGO
 from quadvel_sysid import excitation
 from quadvel_sysid.excitation import EXCITATIONS, MAX_TORQUE_SHARE, PERIOD_S, FootLifting, propose
 
@@ -26,7 +27,7 @@ def eq9(t: float, leg: int) -> float:
 def test_foot_lifting_follows_equation_9() -> None:
     targets = FootLifting(seconds=1.2).targets()
     for row in (0, 37, 125, 180, 250, 333, 501, 870, 1199):
-        feet = foot_positions(targets[row]) - HIPS
+        feet = foot_positions(ALIENGO, targets[row]) - ALIENGO.legs.hips
         np.testing.assert_allclose(feet[:, 2], [eq9(row * PERIOD_S, leg) for leg in range(4)], atol=1e-9)
         np.testing.assert_allclose(feet[:, 0], 0.0, atol=1e-9)
 

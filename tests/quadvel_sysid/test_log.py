@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
 from quadvel_sysid.logs.readers import raw

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_description import robot
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_view.operator import Operator
 from quadvel_view.panel import panel
 from quadvel_view.picture import TOPICS, Ground, RobotPicture
@@ -22,7 +22,7 @@ STATE = "quadvel_msgs/msg/ControllerState"
 
 def test_joints_are_taken_by_their_names() -> None:
     picture = RobotPicture()
-    names = list(reversed(robot.JOINT_NAMES))
+    names = list(reversed(JOINT_NAMES))
     angles, torques = np.linspace(0.0, 1.1, 12), np.linspace(5.0, -6.0, 12)
     joints = message("sensor_msgs/msg/JointState", name=names, position=angles, effort=torques)
     picture.update("/joint_states", joints, 0.0)
@@ -65,7 +65,7 @@ def test_low_state_counts_where_nothing_better_comes() -> None:
     low.orientation_wxyz = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
     picture.update("/low_state", low, 0.0)
     assert picture.q == pytest.approx(np.full(12, 0.3))
-    joints = message("sensor_msgs/msg/JointState", name=list(robot.JOINT_NAMES), position=np.zeros(12))
+    joints = message("sensor_msgs/msg/JointState", name=list(JOINT_NAMES), position=np.zeros(12))
     picture.update("/joint_states", joints, 1.0)
     picture.update("/low_state", low, 1.1)
     assert picture.q == pytest.approx(np.zeros(12))
@@ -126,7 +126,7 @@ def test_numbers_that_are_not_there_are_none_and_the_rest_is_shown() -> None:
 
 def test_readings_of_a_silent_robot_are_not_there() -> None:
     picture = RobotPicture()
-    joints = message("sensor_msgs/msg/JointState", name=list(robot.JOINT_NAMES), position=np.zeros(12))
+    joints = message("sensor_msgs/msg/JointState", name=list(JOINT_NAMES), position=np.zeros(12))
     joints.effort = np.ones(12)
     picture.update("/joint_states", joints, 0.0)
     picture.update("/odom", odometry(0.0, 0.0), 0.0)
@@ -147,8 +147,8 @@ def _cyclic(picture: RobotPicture) -> None:
     ("topic", "make"),
     [
         ("/joint_states", lambda kind: message(kind, name=["elbow"], position=np.zeros(1))),
-        ("/joint_states", lambda kind: message(kind, name=list(robot.JOINT_NAMES), position=np.zeros(3))),
-        ("/joint_states", lambda kind: message(kind, name=list(robot.JOINT_NAMES), position=np.full(12, NAN))),
+        ("/joint_states", lambda kind: message(kind, name=list(JOINT_NAMES), position=np.zeros(3))),
+        ("/joint_states", lambda kind: message(kind, name=list(JOINT_NAMES), position=np.full(12, NAN))),
         ("/odom", lambda kind: odometry(NAN, 0.0)),
         ("/diagnostics", lambda kind: message(kind, status=[message("diagnostic_msgs/msg/DiagnosticStatus", level=b"")])),
         ("/person_tracker/markers", lambda kind: message(kind, markers=[_marker(3)])),

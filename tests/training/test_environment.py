@@ -12,6 +12,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_description import robot  # noqa: E402
 from quadvel_description.kinematics import rotate  # noqa: E402
+from quadvel_description.quadruped import GRAVITY  # noqa: E402
 from quadvel_policy.command_mux import CommandMux, MuxConfig, MuxInput  # noqa: E402
 from quadvel_sim.terrain import Terrain  # noqa: E402
 from quadvel_training import loop, recipe, stages  # noqa: E402
@@ -101,7 +102,7 @@ def test_acceleration_at_rest_is_gravity_upwards():
     for _ in range(400):
         stand(env)
         seen.append(env.acceleration)
-    assert np.mean(seen[200:], axis=(0, 1)) == pytest.approx([0.0, 0.0, robot.GRAVITY], abs=0.15)
+    assert np.mean(seen[200:], axis=(0, 1)) == pytest.approx([0.0, 0.0, GRAVITY], abs=0.15)
 
 
 def test_velocity_is_the_derivative_of_position_in_the_body_frame():

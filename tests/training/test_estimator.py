@@ -10,6 +10,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_description import robot  # noqa: E402
 from quadvel_description.kinematics import rotation_matrix  # noqa: E402
+from quadvel_description.quadruped import GRAVITY  # noqa: E402
 from quadvel_description.state import JointCommand, RobotState  # noqa: E402
 from quadvel_estimator import features  # noqa: E402
 from quadvel_estimator.kalman import KalmanConfig  # noqa: E402
@@ -141,7 +142,7 @@ def moving(**changes) -> RobotState:
         tau=np.zeros(12),
         quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
         angular_velocity=np.zeros(3),
-        linear_acceleration=np.array([0.0, 0.0, robot.GRAVITY]),
+        linear_acceleration=np.array([0.0, 0.0, GRAVITY]),
         foot_force=np.zeros(4),
     )
     return attrs.evolve(still, **changes)
@@ -166,7 +167,7 @@ def test_the_network_can_go_on_by_inertia_alone():
     with torch.no_grad():
         output, _ = network(seen(spinning, ticks), state)
     turned = (1.0 + 0.5j) * np.exp(-1j * rate * ticks * TICK_S)
-    expected = [turned.real, turned.imag, -robot.GRAVITY * ticks * TICK_S]
+    expected = [turned.real, turned.imag, -GRAVITY * ticks * TICK_S]
     np.testing.assert_allclose(output[-1, 0, :3].numpy(), expected, rtol=0.02)
 
 

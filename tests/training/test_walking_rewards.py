@@ -9,6 +9,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
 from quadvel_description import robot  # noqa: E402
+from quadvel_description.quadruped import joint_index  # noqa: E402
 from quadvel_eval.gait_kind import GaitKind  # noqa: E402
 from quadvel_training import gait_log, privileged  # noqa: E402
 from quadvel_training.command_grid import CommandGrid, GridConfig  # noqa: E402
@@ -137,7 +138,7 @@ def test_a_rated_drive_gives_full_torque_at_rest_and_none_at_its_top_speed():
         for name in ("stall", "no_load")
     )
     names = [joint for effect in rated_drives().effects for joint in effect.joints]
-    order = robot.joint_index(names)
+    order = joint_index(names)
     assert sorted(order) == list(range(12))
     assert stall == pytest.approx(np.outer(robot.TORQUE_LIMIT[order], RATED_STALL))
     assert no_load == pytest.approx(np.outer(robot.VELOCITY_LIMIT[order], RATED_SPEED))

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from quadvel_actuator.parameters import ActuatorParameters, Effect
 from quadvel_description.arrays import Array
 from quadvel_description.network_input import InputLayout
-from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
+from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy.modes import Policy
 from quadvel_sim.simulator import Simulator

@@ -20,6 +20,8 @@ from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf, robot
 from quadvel_description.command_range import split_target
 from quadvel_description.kinematics import foot_kinematics, foot_positions, roll_pitch, rotate, rotate_inverse
+from quadvel_description.quadruped import GRAVITY
+from quadvel_description.robot import ALIENGO
 from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_sim.physics import Physics
 from quadvel_sim.terrain import Terrain
@@ -33,7 +35,7 @@ RAMP_DOWN = 4.0  # factor of the slope of commands that decrease
 RAMP_AXES = np.array([1.0, 0.7, 1.25])  # factors of vx, vy and, in rad/m, wz
 EDGE_MARGIN_M = 0.6  # before the end of rough ground, where episodes time out
 MAX_PLAUSIBLE_SPEED = 150.0  # m/s or rad/s of any body or joint; beyond it the physics diverges
-STANCE_LENGTH, STANCE_WIDTH = np.ptp(foot_positions(robot.NOMINAL_Q)[:, :2], axis=0)  # m
+STANCE_LENGTH, STANCE_WIDTH = np.ptp(foot_positions(ALIENGO, robot.NOMINAL_Q)[:, :2], axis=0)  # m
 
 
 def available_cores() -> int:
@@ -288,7 +290,7 @@ class VelocityEnv:
         qpos[:, :2] = rng.uniform(-1, 1, (n, 2)) * self._spawn_radius
         qpos[:, 3:7] = self._ground_attitudes(qpos[:, :2], heading)
         qpos[:, 7:] = posture + rng.normal(0, 0.08, (n, 12))
-        feet = rotate(qpos[:, None, 3:7], foot_positions(qpos[:, 7:])) + qpos[:, None, :3]
+        feet = rotate(qpos[:, None, 3:7], foot_positions(ALIENGO, qpos[:, 7:])) + qpos[:, None, :3]
         qpos[:, 2] = np.max(self._ground(feet) - feet[..., 2], axis=1) + robot.FOOT_RADIUS + 0.002
         self._qpos[ids], self._qvel[ids] = qpos, qvel
         self._clock[ids] = self.config.period  # above 0, so that MuJoCo's own resets are seen
@@ -298,7 +300,7 @@ class VelocityEnv:
         self._new_commands(ids)
         self._update_state()
         self.torque[ids] = 0.0
-        self.acceleration[ids] = rotate_inverse(self.quaternion[ids], np.array([0, 0, robot.GRAVITY]))
+        self.acceleration[ids] = rotate_inverse(self.quaternion[ids], np.array([0, 0, GRAVITY]))
 
     def _ground_attitudes(self, place: np.ndarray, heading: np.ndarray) -> np.ndarray:
         """Attitude of trunks that stand parallel to the ground.
@@ -311,7 +313,7 @@ class VelocityEnv:
             Quaternions (n, 4), w first, body to world.
         """
         level = Rotation.from_euler("Z", heading[:, None])
-        corners = foot_positions(robot.NOMINAL_Q)
+        corners = foot_positions(ALIENGO, robot.NOMINAL_Q)
         feet = np.stack([level.apply(corner) for corner in corners], axis=1)
         forward, left = self._ground_drop(self._ground(feet[..., :2] + place[:, None]))
         pitch = np.arctan(forward)
@@ -395,7 +397,7 @@ class VelocityEnv:
         self._reset_broken(end, before)
         self._update_state()
         # proper acceleration a - g, in the body frame, as an IMU measures it
-        proper = (self._qvel[:, :3] - before) / self.config.timestep + [0.0, 0.0, robot.GRAVITY]
+        proper = (self._qvel[:, :3] - before) / self.config.timestep + [0.0, 0.0, GRAVITY]
         self.acceleration = rotate_inverse(self.quaternion, proper)
         self._ramp_commands(slice(None))
         due = np.flatnonzero(self.time >= self._next_command)
@@ -445,7 +447,7 @@ class VelocityEnv:
         self.velocity = rotate_inverse(self.quaternion, qvel[:, :3])
         self.roll_pitch = roll_pitch(self.quaternion)
         quaternion = self.quaternion[:, None]
-        local, jacobians = foot_kinematics(self.q)
+        local, jacobians = foot_kinematics(ALIENGO, self.q)
         self.foot_position = local
         self.feet = rotate(quaternion, local) + qpos[:, None, :3]
         # v_foot = R (J dq + w x r) + v_trunk

@@ -17,7 +17,7 @@ import attrs
 import numpy as np
 import torch
 
-from quadvel_description.robot import GRAVITY
+from quadvel_description.quadruped import GRAVITY
 from quadvel_estimator import features
 from quadvel_sim.terrain import Terrain
 

@@ -42,7 +42,7 @@ ACTION_BOUND = 4.0  # in the network's unit
 STRIDE_S = 0.35  # time constant of stride errors: about a stride
 LASTING_S = 1.5  # time constant of lasting errors
 TRANSIENT_S = 1.0  # after a new command, not part of lasting errors and scores
-HIPS_AHEAD = robot.HIP_OFFSET[0] * np.array([robot.FRONT[leg] for leg in robot.LEGS])  # m, body frame
+HIPS_AHEAD = robot.ALIENGO.legs.hips[:, 0]  # m, body frame
 STANDING_S = 0.2  # on four feet; after that, setting off means choosing a side
 WALKING_HEIGHT_M = 0.38  # typical height of the trunk
 

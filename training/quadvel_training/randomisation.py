@@ -9,7 +9,8 @@ from mujoco.batch import Batch
 
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters, Effect
-from quadvel_description.robot import JOINT_NAMES, TORQUE_LIMIT, VELOCITY_LIMIT
+from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
 
 STALL_RANGE_NM, NO_LOAD_RANGE_RAD_S = (24.0, 60.0), (12.0, 30.0)  # of `limited`, drawn per robot
 RATED_STALL, RATED_SPEED = (

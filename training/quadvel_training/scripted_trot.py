@@ -10,12 +10,13 @@ import numpy as np
 
 from quadvel_description import robot
 from quadvel_description.kinematics import foot_positions, inverse_kinematics
+from quadvel_description.robot import ALIENGO
 
 from .env import VelocityEnv
 from .gait_clock import GaitClock, duty_factor, step_frequency
 
 CROUCH_M = 0.03  # by which the trunk is lower than in the nominal posture: longer steps are in reach
-FEET = foot_positions(robot.NOMINAL_Q) + np.array([0.0, 0.0, CROUCH_M])  # (4, 3), m, trunk frame
+FEET = foot_positions(ALIENGO, robot.NOMINAL_Q) + np.array([0.0, 0.0, CROUCH_M])  # (4, 3), m, trunk frame
 LIFT_M = 0.08  # height of a swing
 LONGEST_STEP_M = 0.36  # way of a foot under the trunk in one stance
 LEAD_S = 0.05  # joints follow their targets so late
@@ -62,4 +63,6 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
     # a planned stance carries 4 / (number of planned stances) of its load on four feet
     carried = down * 4.0 / np.maximum(down.sum(axis=1, keepdims=True), 1) - 1.0
     load = np.repeat(carried, 3, axis=1) * (env.stand_q - robot.NOMINAL_Q)
-    return np.asarray((inverse_kinematics(feet) - robot.NOMINAL_Q + load) * (standing < 0.5)[:, None])
+    return np.asarray(
+        (inverse_kinematics(ALIENGO, feet) - robot.NOMINAL_Q + load) * (standing < 0.5)[:, None]
+    )

@@ -20,7 +20,7 @@ from quadvel_actuator.delay import DelayLine
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_actuator.running import RunningEffects
 from quadvel_description.arrays import Array
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 
 Values = float | Array
 

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.state import RobotState
 from quadvel_driver.find_calibration import CalibrationDataError, CalibrationFit, Samples, fit_calibration
 from quadvel_nodes.messages import read_low_state

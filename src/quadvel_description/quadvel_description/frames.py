@@ -16,9 +16,11 @@ import numpy as np
 from . import robot
 from .arrays import Array
 from .kinematics import foot_positions, rotate, rotate_inverse, yaw
+from .robot import ALIENGO
+from .urdf import ROOT
 
 ODOM = "odom"
-BASE = "base_link"
+BASE = ROOT
 FOOTPRINT = "base_footprint"
 IMU = "imu_link"
 LASER = "laser"
@@ -89,6 +91,6 @@ def footprint(q: Array, quaternion: Array) -> FramePose:
     c, s = np.cos(half), np.sin(half)
     w, x, y, z = quaternion
     tilt = np.array([c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w])
-    floor = rotate(tilt, foot_positions(q))[..., 2].min() - robot.FOOT_RADIUS
+    floor = rotate(tilt, foot_positions(ALIENGO, q))[..., 2].min() - robot.FOOT_RADIUS
     below = rotate_inverse(tilt, np.array([0.0, 0.0, floor]))
     return FramePose(BASE, FOOTPRINT, below, tilt * [1.0, -1.0, -1.0, -1.0])

@@ -6,15 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .robot import CALF_LENGTH, FRONT, HIP_OFFSET, LEFT, LEGS, THIGH_LENGTH, THIGH_OFFSET
-
-_LATERAL_OFFSETS = THIGH_OFFSET * np.array([LEFT[leg] for leg in LEGS], float)
-_LINK_Z = -np.array([THIGH_LENGTH, CALF_LENGTH])  # m; negative: at zero angles the links hang down
-HIPS = np.array([[HIP_OFFSET[0] * FRONT[leg], HIP_OFFSET[1] * LEFT[leg], 0.0] for leg in LEGS])
-"""Hip joints in the trunk frame, (4, 3), m."""
+from .robot import LegGeometry, Robot
 
 
-def _leg_planes(q: np.ndarray) -> tuple[np.ndarray, ...]:
+def _leg_planes(legs: LegGeometry, q: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the links of each leg in its own plane.
 
     Returns forward and up components of thigh and calf, (..., 4, 2) each, and sine and cosine of
@@ -23,52 +18,61 @@ def _leg_planes(q: np.ndarray) -> tuple[np.ndarray, ...]:
     angles = np.array(q, float).reshape(*np.shape(q)[:-1], 4, 3)
     angles[..., 2] += angles[..., 1]  # the calf relative to the trunk
     sines, cosines = np.sin(angles), np.cos(angles)
-    return sines[..., 1:] * _LINK_Z, cosines[..., 1:] * _LINK_Z, sines[..., 0], cosines[..., 0]
+    links = legs.links  # along -z at zero angles
+    return sines[..., 1:] * links, cosines[..., 1:] * links, sines[..., 0], cosines[..., 0]
 
 
-def _feet_from_hips(forward: np.ndarray, up: np.ndarray, s: np.ndarray, c: np.ndarray) -> np.ndarray:
+def _feet_from_hips(
+    legs: LegGeometry, forward: np.ndarray, up: np.ndarray, s: np.ndarray, c: np.ndarray
+) -> np.ndarray:
     """Return the foot positions relative to the hip joints, (..., 4, 3)."""
+    lateral = legs.lateral
     feet, z = np.empty((*s.shape, 3)), up[..., 0] + up[..., 1]
     feet[..., 0] = forward[..., 0] + forward[..., 1]
-    feet[..., 1], feet[..., 2] = _LATERAL_OFFSETS * c - z * s, _LATERAL_OFFSETS * s + z * c
+    feet[..., 1], feet[..., 2] = lateral * c - z * s, lateral * s + z * c
     return feet
 
 
-def foot_positions(q: np.ndarray) -> np.ndarray:
+def foot_positions(robot: Robot, q: np.ndarray) -> np.ndarray:
     """Compute the centres of the foot spheres in the trunk frame.
 
     Args:
+        robot: The robot.
         q: Joint positions, (..., 12), rad.
 
     Returns:
         Positions, (..., 4, 3), m.
     """
-    return _feet_from_hips(*_leg_planes(q)) + HIPS
+    legs = robot.legs
+    return _feet_from_hips(legs, *_leg_planes(legs, q)) + legs.hips
 
 
-def foot_jacobians(q: np.ndarray) -> np.ndarray:
+def foot_jacobians(robot: Robot, q: np.ndarray) -> np.ndarray:
     """Compute the Jacobians of the foot positions.
 
     Args:
+        robot: The robot.
         q: Joint positions, (..., 12), rad.
 
     Returns:
         d foot / d (hip, thigh, calf) in the trunk frame, (..., 4, 3, 3), m/rad; columns are joints.
     """
-    return foot_kinematics(q)[1]
+    return foot_kinematics(robot, q)[1]
 
 
-def foot_kinematics(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def foot_kinematics(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute foot positions and Jacobians together.
 
     Args:
+        robot: The robot.
         q: Joint positions, (..., 12), rad.
 
     Returns:
         Positions, (..., 4, 3), m, and Jacobians, (..., 4, 3, 3), m/rad; columns are joints.
     """
-    forward, up, s, c = _leg_planes(q)
-    feet = _feet_from_hips(forward, up, s, c)
+    legs = robot.legs
+    forward, up, s, c = _leg_planes(legs, q)
+    feet = _feet_from_hips(legs, forward, up, s, c)
     # Hip about x: d foot / d hip = (0, -z, y). Thigh and calf turn in the leg's plane about their
     # joint: with x forward and z up of the foot relative to the joint, d foot / d angle is
     # (z, x sin(hip), -x cos(hip)).
@@ -77,30 +81,33 @@ def foot_kinematics(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for joint, x, z in ((1, feet[..., 0], up[..., 0] + up[..., 1]), (2, forward[..., 1], up[..., 1])):
         jacobians[..., 0, joint] = z
         jacobians[..., 1, joint], jacobians[..., 2, joint] = x * s, -x * c
-    return feet + HIPS, jacobians
+    return feet + legs.hips, jacobians
 
 
-def inverse_kinematics(feet: np.ndarray) -> np.ndarray:
-    """Compute the joint positions that reach given foot positions; knees bend backward.
+def inverse_kinematics(robot: Robot, feet: np.ndarray) -> np.ndarray:
+    """Compute the joint positions that reach given foot positions; knees bend as in the stance.
 
     Args:
+        robot: The robot.
         feet: Foot centres in the trunk frame, (..., 4, 3), m.
 
     Returns:
         Joint positions, (..., 12), rad; a foot out of reach goes to the nearest reachable distance.
     """
-    p = np.asarray(feet, float) - HIPS
+    legs = robot.legs
+    l1, l2 = legs.thigh, legs.calf
+    p = np.asarray(feet, float) - legs.hips
     x, y, z = p[..., 0], p[..., 1], p[..., 2]
     # The hip turns the leg's plane until the foot lies at `depth` below the thigh joint in it:
     # depth^2 = y^2 + z^2 - offset^2. In the plane the law of cosines gives the knee:
     # cos(calf) = (reach^2 - l1^2 - l2^2) / (2 l1 l2).
-    depth = np.sqrt(np.maximum(y**2 + z**2 - THIGH_OFFSET**2, 1e-8))
-    hip = np.arctan2(z, y) - np.arctan2(-depth, _LATERAL_OFFSETS)
+    depth = np.sqrt(np.maximum(y**2 + z**2 - legs.lateral**2, 1e-8))
+    hip = np.arctan2(z, y) - np.arctan2(-depth, legs.lateral)
     hip = np.arctan2(np.sin(hip), np.cos(hip))
-    reach = np.clip(np.hypot(x, depth), abs(THIGH_LENGTH - CALF_LENGTH) + 1e-6, THIGH_LENGTH + CALF_LENGTH)
-    cos_knee = (reach**2 - THIGH_LENGTH**2 - CALF_LENGTH**2) / (2 * THIGH_LENGTH * CALF_LENGTH)
-    calf = -np.arccos(np.clip(cos_knee, -1.0, 1.0))
-    lead = np.arctan2(CALF_LENGTH * np.sin(-calf), THIGH_LENGTH + CALF_LENGTH * np.cos(calf))
+    reach = np.clip(np.hypot(x, depth), abs(l1 - l2) + 1e-6, l1 + l2)
+    cos_knee = (reach**2 - l1**2 - l2**2) / (2 * l1 * l2)
+    calf = legs.knees * np.arccos(np.clip(cos_knee, -1.0, 1.0))
+    lead = np.arctan2(l2 * np.sin(-calf), l1 + l2 * np.cos(calf))
     thigh = np.arctan2(-x, depth) + lead
     return np.stack([hip, thigh, calf], axis=-1).reshape(*p.shape[:-2], 12)
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import robot
-from .robot import FOOT_RADIUS, KINDS, LEFT, LEGS
+from .quadruped import GRAVITY, JOINT_NAMES, KINDS, LEFT, LEGS
+from .robot import FOOT_RADIUS
 
 
 def _text(values: ArrayLike) -> str:
@@ -57,8 +58,8 @@ def _leg_xml(leg: str, plant: Plant) -> str:
         "calf": '<geom class="shell" type="box" size="0.008 0.0104 0.125" pos="0 0 -0.125"/>',
     }
     foot = (
-        f'<geom class="foot" name="{leg}_foot" pos="0 0 {-robot.CALF_LENGTH!r}"/>'
-        f'<site name="{leg}_foot" pos="0 0 {-robot.CALF_LENGTH!r}" size="{FOOT_RADIUS!r}"/>'
+        f'<geom class="foot" name="{leg}_foot" pos="0 0 {-robot.ALIENGO.legs.calf!r}"/>'
+        f'<site name="{leg}_foot" pos="0 0 {-robot.ALIENGO.legs.calf!r}" size="{FOOT_RADIUS!r}"/>'
     )
     inner = foot
     for k in reversed(range(3)):
@@ -91,7 +92,7 @@ def _keyframe_xml(name: str, height: float, q: np.ndarray) -> str:
 def mjcf(plant: Plant | None = None) -> str:
     """Create the model as MJCF text.
 
-    Motors take joint torques in N m in the order of `robot.JOINT_NAMES`.
+    Motors take joint torques in N m in the order of `JOINT_NAMES`.
 
     Args:
         plant: Variable properties; None: the nominal robot.
@@ -117,7 +118,7 @@ def mjcf(plant: Plant | None = None) -> str:
     )
     motors = "\n    ".join(
         f'<motor name="{name}" joint="{name}" ctrlrange="{-limit!r} {limit!r}"/>'
-        for name, limit in zip(robot.JOINT_NAMES, robot.TORQUE_LIMIT.tolist(), strict=True)
+        for name, limit in zip(JOINT_NAMES, robot.TORQUE_LIMIT.tolist(), strict=True)
     )
     legs = "\n      ".join(_leg_xml(leg, plant) for leg in LEGS)
     # relpose: where the world is, seen from the trunk
@@ -132,7 +133,7 @@ def mjcf(plant: Plant | None = None) -> str:
     return f"""<mujoco model="aliengo">
   <compiler angle="radian" autolimits="true"/>
   <option timestep="{plant.timestep!r}" integrator="implicitfast" cone="elliptic" impratio="10"
-          iterations="20" ls_iterations="20" gravity="0 0 {-robot.GRAVITY!r}"/>
+          iterations="20" ls_iterations="20" gravity="0 0 {-GRAVITY!r}"/>
   <default>
     <geom contype="0" conaffinity="1" condim="3" solref="0.01 1" friction="{plant.foot_friction!r} 0.02 0.01"/>
     <default class="visual"><geom contype="0" conaffinity="0" group="1" rgba="0.25 0.27 0.3 1"/></default>
@@ -157,7 +158,7 @@ def mjcf(plant: Plant | None = None) -> str:
       <freejoint name="root"/>
       <inertial mass="{_text(trunk.mass)}" pos="{_text(trunk.com)}" fullinertia="{_text(trunk.fullinertia())}"/>
       <geom name="trunk" class="shell" type="box" size="0.3235 0.075 0.056" rgba="0.8 0.82 0.85 1"/>
-      <site name="imu" pos="{_text(robot.IMU_POSITION)}" size="0.01"/>
+      <site name="imu" pos="{"0.0 0.0 0.0"}" size="0.01"/>
       {legs}
     </body>
   </worldbody>
@@ -211,7 +212,7 @@ def gravity_torque(model: mujoco.MjModel) -> np.ndarray:
     mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
     mujoco.mj_forward(model, data)
     # Static equilibrium: tau = bias(q) - sum over feet of J^T (0, 0, weight / 4).
-    weight = float(model.body_subtreemass[1]) * robot.GRAVITY
+    weight = float(model.body_subtreemass[1]) * GRAVITY
     torque = data.qfrc_bias[6:].copy()
     jacobian = np.zeros((3, model.nv))
     for leg in LEGS:

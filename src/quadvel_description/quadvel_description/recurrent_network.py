@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from . import ahead
 from .network_file import NetworkFileError, read_network
 from .onnx_format import Message, serialise
-from .robot import JOINT_NAMES
+from .quadruped import JOINT_NAMES
 from .robot_name import UNNAMED_ROBOT
 
 METADATA_KEY = "quadvel"

@@ -1,245 +1,310 @@
-"""Numbers of the AlienGo: joints, limits, postures, inertias; all models derive from them.
+"""A robot as one value: `load_robot("aliengo")` reads its folder, and the value is passed on.
 
-Sources. Kinematics and inertias: Unitree's `aliengo_description` (xacro of November 2022, BSD-3),
-inertias about each link's centre of mass. Command limits: Unitree's SDK (`aliengo_const.h`).
-Armature and joint friction: rounded mean of the two public identifications of a real, suspended
-AlienGo by IIT's DLS lab (chirps).
+The folder of a robot, `robots/<name>` or one elsewhere, holds
+
+    robot.yaml   numbers that no model file has: postures, gains, limits, friction, the drive
+    robot.urdf   links, inertias and ranges of the joints; also shown by RViz and Foxglove
+    robot.xml    MJCF with the shapes that touch the ground, for the simulation
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import attrs
 import numpy as np
 
-LEGS = ("FR", "FL", "RR", "RL")
-KINDS = ("hip", "thigh", "calf")
-JOINT_NAMES = tuple(f"{leg}_{kind}_joint" for leg in LEGS for kind in KINDS)
-FRONT = {"FR": 1, "FL": 1, "RR": -1, "RL": -1}  # sign of x
-LEFT = {"FR": -1, "FL": 1, "RR": -1, "RL": 1}  # sign of y
+from .arrays import Array
+from .fields import field, positive, refusal, to_array
+from .inertia import Inertial, combine_inertials
+from .quadruped import JOINT_NAMES, LEGS
+from .records import read_document, structure_record
+from .symmetry import mirror_joints
+from .urdf import read_links
 
-HIP_OFFSET = (0.2407, 0.051)  # trunk to hip joint, |x| and |y|, m
-THIGH_OFFSET = 0.0868  # hip to thigh joint, |y|, m
-THIGH_LENGTH = 0.25  # m
-CALF_LENGTH = 0.25  # to the centre of the foot sphere, m
-FOOT_RADIUS = 0.0265  # m
-
-KP = 30.0  # N m/rad, Section 4.1 of the paper
-KD = 0.5  # N m s/rad
-
-GRAVITY = 9.81  # m/s^2
+SCHEMA = 1
+_SHIPPED = Path(__file__).parent / "robots"
 
 
-def _per_leg(hip: float, thigh: float, calf: float) -> np.ndarray:
-    """Return the same three values for every leg, (12,), read-only."""
-    values = np.tile([hip, thigh, calf], 4).astype(float)
-    values.flags.writeable = False
-    return values
-
-
-def _hip_range(inward: float, outward: float) -> tuple[list[float], list[float]]:
-    """Return lower and upper hip limits per leg.
-
-    Positive hip angles move a left foot outward and a right foot inward.
-    """
-    lower = [-inward if LEFT[leg] > 0 else -outward for leg in LEGS]
-    upper = [outward if LEFT[leg] > 0 else inward for leg in LEGS]
-    return lower, upper
-
-
-def _with_hips(hips: list[float], thigh: float, calf: float) -> np.ndarray:
-    """Return joint values, (12,), read-only; hips differ, thighs and calves are equal."""
-    values = np.array([angle for hip in hips for angle in (hip, thigh, calf)])
-    values.flags.writeable = False
-    return values
-
-
-NOMINAL_Q = _per_leg(0.0, 0.6435, -1.287)  # rad, stance: feet 0.4 m below the hips
-LIE_Q = _per_leg(0.0, 1.343, -2.696)  # rad
-NOMINAL_HEIGHT = 0.4265  # m, trunk above ground in NOMINAL_Q
-LIE_HEIGHT = 0.137  # m
-SUSPENDED_HEIGHT = 1.0  # m, trunk above ground if the robot is held in the air
-
-# mechanical range
-LOWER = _per_leg(-1.2217305, -2.0943951, -2.7750735)
-UPPER = _per_leg(1.2217305, 4.1887902, -0.6457718)
-# command range: intersection of the mechanical range and the limits of the SDK
-_HIP_LOWER, _HIP_UPPER = _hip_range(inward=0.873, outward=1.047)
-COMMAND_LOWER = _with_hips(_HIP_LOWER, -0.524, -2.775)
-COMMAND_UPPER = _with_hips(_HIP_UPPER, 3.927, -0.646)
-
-TORQUE_LIMIT = _per_leg(35.278, 35.278, 44.4)  # N m
-VELOCITY_LIMIT = _per_leg(20.0, 20.0, 15.89)  # rad/s
-
-ARMATURE = _per_leg(0.015, 0.015, 0.023)  # kg m^2, reflected rotor inertia
-FRICTION = _per_leg(0.45, 0.30, 0.37)  # N m, Coulomb
-DAMPING = _per_leg(0.2, 0.2, 0.27)  # N m s/rad
-
-IMU_POSITION = (0.0, 0.0, 0.0)  # in the trunk frame
-
-
-@attrs.frozen
-class Inertial:
-    """Inertia of a rigid body.
-
-    Attributes:
-        mass: Mass, kg.
-        com: Centre of mass, (3,), m, link frame.
-        tensor: Inertia tensor about the centre of mass, (3, 3), kg m^2, link axes.
-    """
-
-    mass: float
-    com: np.ndarray
-    tensor: np.ndarray
-
-    def translated(self, offset: Sequence[float]) -> Inertial:
-        """Return the same body in a frame in which the link's origin lies at an offset.
-
-        Args:
-            offset: Position of the link's origin, (3,), m.
-
-        Returns:
-            The inertia in that frame.
-        """
-        return attrs.evolve(self, com=self.com + np.asarray(offset, float))
-
-    def fullinertia(self) -> list[float]:
-        """Return the tensor as MuJoCo's `fullinertia`.
-
-        Returns:
-            [ixx, iyy, izz, ixy, ixz, iyz], kg m^2.
-        """
-        t = self.tensor
-        return [t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2]]
-
-
-def combine_inertials(parts: Iterable[Inertial]) -> Inertial:
-    """Combine rigid bodies that are fixed to each other.
-
-    Args:
-        parts: Inertias in a common frame.
+def shipped_robots() -> tuple[str, ...]:
+    """List the robots that ship with the package.
 
     Returns:
-        Inertia of the combined body.
+        Their names.
     """
-    parts = list(parts)
-    # Parallel-axis theorem: I = sum of I_i + m_i (d.d 1 - d d^T), d from the common centre of mass.
-    mass = sum(p.mass for p in parts)
-    com = sum((p.mass * p.com for p in parts), np.zeros(3)) / mass
-    tensor = np.zeros((3, 3))
-    for p in parts:
-        d = p.com - com
-        tensor += p.tensor + p.mass * (d @ d * np.eye(3) - np.outer(d, d))
-    return Inertial(mass, com, tensor)
+    return tuple(sorted(file.parent.name for file in _SHIPPED.glob("*/robot.yaml")))
 
 
-def _inertial(mass: float, com: Sequence[float], full: Sequence[float]) -> Inertial:
-    """Return an inertia from MuJoCo's `fullinertia` order."""
-    ixx, iyy, izz, ixy, ixz, iyz = full
-    return Inertial(mass, np.array(com), np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]))
+@cache
+def load_robot(robot: str) -> Robot:
+    """Load a robot. Equal arguments give the same value.
+
+    Args:
+        robot: Name of a shipped robot, or path of a folder or of its `robot.yaml`.
+
+    Returns:
+        The robot.
+
+    Raises:
+        FileNotFoundError: There is no such robot, or a file of its folder is missing.
+        ValueError: A file of its folder is wrong; the message names file, field, value found and
+            expectation.
+    """
+    path = Path(robot) if robot not in shipped_robots() else _SHIPPED / robot
+    file = path / "robot.yaml" if path.is_dir() else path
+    if not file.is_file():
+        names = ", ".join(shipped_robots())
+        raise FileNotFoundError(f"robot: found {robot!r}, expected {names} or the path of a robot.yaml")
+    fields = read_document(file, "a YAML file of a robot", SCHEMA)
+    links = read_links(file.parent / "robot.urdf")
+    return structure_record(Robot, {**fields, "links": links, "folder": str(file.parent)}, file)
 
 
-_TRUNK = _inertial(
-    11.644,
-    (0.008811, 0.003839, 0.000273),
-    (0.051944892, 0.24693924, 0.270948307, 0.001703617, 0.000235941, 0.000119783),
-)
-_IMU = _inertial(0.001, (0, 0, 0), (1e-4, 1e-4, 1e-4, 0, 0, 0))
-_CALF = _inertial(
-    0.207,
-    (0.002781, 0.000063, -0.142518),
-    (0.002129279, 0.002141463, 0.000037583, 0.000000039, 0.000005757, -0.000000516),
-)
-_FOOT = _inertial(0.060, (0, 0, 0), (1.6854e-5, 1.6854e-5, 1.6854e-5, 0, 0, 0))
-_HIP_ROTOR = _inertial(0.146, (0, 0, 0), (0.000138702, 0.000083352, 0.000083352, 0, 0, 0))
-_THIGH_ROTOR = _inertial(0.146, (0, 0, 0), (0.000083352, 0.000138702, 0.000083352, 0, 0, 0))
-_CALF_ROTOR = _inertial(0.132, (0, 0, 0), (0.000145463, 0.000133031, 0.000145463, 0, 0, 0))
+def _per_joint(value: Any) -> Any:
+    """Expand one number, three (hip, thigh, calf) or twelve to a read-only array, (12,)."""
+    array = to_array(None, value)
+    if isinstance(array, np.ndarray) and array.shape == (3,):
+        return to_array(None, np.tile(array, len(LEGS)))
+    return to_array(len(JOINT_NAMES), value)
 
 
-@attrs.frozen
+def _joints(description: str) -> Any:
+    """Declare a field with a number for each joint."""
+    return attrs.field(converter=_per_joint, validator=_check_joints, metadata={"description": description})
+
+
+def _check_joints(robot: object, attribute: attrs.Attribute[Any], value: Any) -> None:
+    """Refuse anything but twelve finite numbers."""
+    if (
+        not isinstance(value, np.ndarray)
+        or value.shape != (len(JOINT_NAMES),)
+        or not np.isfinite(value).all()
+    ):
+        raise refusal(robot, attribute.name, value, "1, 3 (hip, thigh, calf) or 12 finite numbers")
+
+
+@attrs.frozen(eq=False, kw_only=True)
 class Link:
-    """A link of the robot.
+    """A link of the robot, with the joint to its parent.
 
     Attributes:
         name: Name of the link.
         parent: Name of its parent; None for the trunk.
-        axis: Axis of its joint, `x` or `y`; None: fixed.
+        joint: Name of the joint if it moves, else None.
+        axis: Axis of the joint, `x` or `y`; None: fixed.
         origin: Origin of the joint in the parent frame, (3,), m.
         inertial: Inertia of the link.
+        lower: Mechanical range of the joint, rad.
+        upper: Mechanical range of the joint, rad.
     """
 
     name: str
     parent: str | None
+    joint: str | None
     axis: str | None
     origin: tuple[float, float, float]
     inertial: Inertial
+    lower: float = 0.0
+    upper: float = 0.0
 
 
-def _leg_links(leg: str) -> list[Link]:
-    """Return the links of a leg."""
-    sx, sy = FRONT[leg], LEFT[leg]
-    hip = _inertial(
-        1.993,
-        (-0.022191 * sx, 0.015144 * sy, -0.000015),
-        (0.002446735, 0.003925876, 0.004148145, -0.00059805 * sx * sy, 0.000001945 * sx, 0.000001284 * sy),
-    )
-    thigh = _inertial(
-        0.639,
-        (-0.005607, -0.003877 * sy, -0.048199),
-        (0.004173855, 0.004343802, 0.000340136, 0.000010284 * sy, -0.000318874, 0.000109233 * sy),
-    )
-    hip_x, hip_y = HIP_OFFSET[0] * sx, HIP_OFFSET[1] * sy
-    return [
-        Link(f"{leg}_hip", "trunk", "x", (hip_x, hip_y, 0.0), hip),
-        Link(f"{leg}_hip_rotor", "trunk", None, (0.139985 * sx, hip_y, 0.0), _HIP_ROTOR),
-        Link(f"{leg}_thigh", f"{leg}_hip", "y", (0.0, THIGH_OFFSET * sy, 0.0), thigh),
-        Link(f"{leg}_thigh_rotor", f"{leg}_hip", None, (0.0, 0.0298 * sy, 0.0), _THIGH_ROTOR),
-        Link(f"{leg}_calf", f"{leg}_thigh", "y", (0.0, 0.0, -THIGH_LENGTH), _CALF),
-        Link(f"{leg}_calf_rotor", f"{leg}_thigh", None, (0.0, -0.0997 * sy, 0.0), _CALF_ROTOR),
-        Link(f"{leg}_foot", f"{leg}_calf", None, (0.0, 0.0, -CALF_LENGTH), _FOOT),
-    ]
+@attrs.frozen(eq=False)
+class LegGeometry:
+    """Lengths of the legs, for `kinematics`.
 
-
-LINKS: tuple[Link, ...] = (
-    Link("trunk", None, None, (0.0, 0.0, 0.0), _TRUNK),
-    Link("imu_link", "trunk", None, IMU_POSITION, _IMU),
-    *(link for leg in LEGS for link in _leg_links(leg)),
-)
-MASS = sum(link.inertial.mass for link in LINKS)  # kg
-
-
-def combined_inertial(name: str) -> Inertial:
-    """Return the inertia of a moving link together with everything that is fixed to it.
-
-    Args:
-        name: Name of the link.
-
-    Returns:
-        Inertia in the link's frame.
+    Attributes:
+        hips: Hip joints in the trunk frame, (4, 3), m.
+        lateral: Thigh joint to the left of the hip joint, (4,), m.
+        links: Thighs and calves along z if all angles are zero, (2,), m, negative.
+        thigh: Length of the thighs, m.
+        calf: Length of the calves to the centre of the foot sphere, m.
+        knees: Sign of the calf angle in the nominal posture, (4,); -1: the knee bends backward.
     """
-    own = next(link for link in LINKS if link.name == name)
-    fixed = [link for link in LINKS if link.parent == name and link.axis is None]
-    return combine_inertials([own.inertial, *(link.inertial.translated(link.origin) for link in fixed)])
+
+    hips: Array
+    lateral: Array
+    links: Array
+    thigh: float
+    calf: float
+    knees: Array
 
 
-def joint_index(names: Sequence[str]) -> list[int]:
-    """Find joints in JOINT_NAMES.
+@attrs.frozen(kw_only=True)
+class Drive:
+    """How the robot's drives are reached.
 
-    Args:
-        names: Joint names, with or without `_joint`.
-
-    Returns:
-        Index of each joint.
-
-    Raises:
-        ValueError: A name is unknown; the message names it.
+    Attributes:
+        board: Protocol of the robot's board, `unitree_udp` or `unitree_dds`.
+        no_state_hint: What to check if no state arrives.
+        dropped_out_mode: Mode of a motor that the board has switched off; None: unknown.
     """
-    index = {name: i for i, name in enumerate(JOINT_NAMES)}
-    found = []
-    for name in names:
-        full = name if name.endswith("_joint") else f"{name}_joint"
-        if full not in index:
-            raise ValueError(f"joint names: found {name!r}, expected one of {', '.join(JOINT_NAMES)}")
-        found.append(index[full])
-    return found
+
+    board: str = field("unitree_udp", one_of=("unitree_udp", "unitree_dds"))
+    no_state_hint: str
+    dropped_out_mode: int | None = None
+
+
+@attrs.frozen(eq=False, kw_only=True)
+class Robot:
+    """All numbers of a robot. Joint order as in `quadruped.JOINT_NAMES`; all arrays are read-only.
+
+    Attributes:
+        name: Name of the robot in files.
+        title: Name of the robot in texts.
+        folder: Folder of its files.
+        kp: Usual proportional gain, N m/rad.
+        kd: Usual derivative gain, N m s/rad.
+        nominal_q: Joint positions of the stance, (12,), rad.
+        nominal_height: Trunk above ground in the stance, m.
+        lie_q: Joint positions lying, (12,), rad.
+        lie_height: Trunk above ground lying, m.
+        suspended_height: Trunk above ground if the robot is held in the air, m.
+        torque_limit: Largest torque, (12,), N m.
+        velocity_limit: Speed at which the drive has no torque left, (12,), rad/s.
+        command_lower: Least joint target that the drives accept, (12,), rad.
+        command_upper: Largest joint target that the drives accept, (12,), rad.
+        armature: Reflected rotor inertia, (12,), kg m^2.
+        joint_friction: Coulomb friction, (12,), N m.
+        joint_damping: Viscous friction, (12,), N m s/rad.
+        foot_radius: Radius of the foot spheres, m.
+        drive: How its drives are reached.
+        links: Links, parents before their children.
+        lower: Mechanical range, (12,), rad.
+        upper: Mechanical range, (12,), rad.
+        mass: Mass of all links, kg.
+        legs: Lengths of the legs.
+    """
+
+    name: str
+    title: str
+    folder: Path = attrs.field(converter=Path)
+    kp: float = positive()
+    kd: float = positive()
+    nominal_q: Array = _joints("stance, rad")
+    nominal_height: float = positive()
+    lie_q: Array = _joints("lying, rad")
+    lie_height: float = positive()
+    suspended_height: float = positive()
+    torque_limit: Array = _joints("N m")
+    velocity_limit: Array = _joints("rad/s")
+    command_lower: Array = _joints("rad")
+    command_upper: Array = _joints("rad")
+    armature: Array = _joints("kg m^2")
+    joint_friction: Array = _joints("N m")
+    joint_damping: Array = _joints("N m s/rad")
+    foot_radius: float = positive()
+    drive: Drive
+    links: tuple[Link, ...]
+    lower: Array = attrs.field(init=False)
+    upper: Array = attrs.field(init=False)
+    mass: float = attrs.field(init=False)
+    legs: LegGeometry = attrs.field(init=False)
+
+    @lower.default
+    def _lower(self) -> Array:
+        return _per_joint([link.lower for link in self.joint_links])
+
+    @upper.default
+    def _upper(self) -> Array:
+        return _per_joint([link.upper for link in self.joint_links])
+
+    @mass.default
+    def _mass(self) -> float:
+        return sum(link.inertial.mass for link in self.links)
+
+    @legs.default
+    def _legs(self) -> LegGeometry:
+        return _leg_geometry(self)
+
+    def __attrs_post_init__(self) -> None:
+        """Refuse postures out of range, and limits or postures that are not left-right symmetric."""
+        for name in ("nominal_q", "lie_q", "command_lower", "command_upper"):
+            q = getattr(self, name)
+            if (outside := (q < self.lower) | (q > self.upper)).any():
+                i = int(np.argmax(outside))
+                expected = f"{self.lower[i]} to {self.upper[i]} at {JOINT_NAMES[i]}, its range in robot.urdf"
+                raise refusal(self, name, float(q[i]), expected)
+        for name in ("nominal_q", "lie_q"):
+            if not np.array_equal(mirror_joints(q := getattr(self, name)), q):
+                raise refusal(self, name, q, "left and right legs that are mirror images")
+
+    @property
+    def urdf_file(self) -> Path:
+        """URDF: links, inertias, ranges."""
+        return self.folder / "robot.urdf"
+
+    @property
+    def mjcf_file(self) -> Path:
+        """MJCF: the model of the simulation."""
+        return self.folder / "robot.xml"
+
+    @property
+    def joint_links(self) -> tuple[Link, ...]:
+        """Links that a joint moves, 12, in the order of JOINT_NAMES."""
+        links = {link.joint: link for link in self.links}
+        return tuple(links[name] for name in JOINT_NAMES)
+
+    def combined_inertial(self, name: str) -> Inertial:
+        """Compute the inertia of a moving link together with everything that is fixed to it.
+
+        Args:
+            name: Name of the link.
+
+        Returns:
+            Inertia in the link's frame.
+        """
+        own = next(link for link in self.links if link.name == name)
+        fixed = [link for link in self.links if link.parent == name and link.axis is None]
+        return combine_inertials([own.inertial, *(link.inertial.translated(link.origin) for link in fixed)])
+
+
+def _leg_geometry(robot: Robot) -> LegGeometry:
+    """Compute the lengths of the legs from the links; legs of another shape are refused."""
+    links = {link.name: link for link in robot.links}
+
+    def origins(kind: str) -> Array:
+        """Origins of one kind of link, (4, 3)."""
+        if missing := [leg for leg in LEGS if f"{leg}_{kind}" not in links]:
+            raise ValueError(f"{robot.urdf_file}: link {missing[0]}_{kind}: found none, expected one")
+        return np.array([links[f"{leg}_{kind}"].origin for leg in LEGS])
+
+    def length(kind: str) -> float:
+        """Distance of a joint below its parent; the same on all legs."""
+        found = origins(kind)
+        if found[:, :2].any() or np.ptp(found[:, 2]) or found[0, 2] >= 0:
+            raise ValueError(
+                f"{robot.urdf_file}: origins of the {kind} links: found {found.tolist()}, "
+                "expected the same place straight below the joint before, on all legs"
+            )
+        return -float(found[0, 2])
+
+    thighs = origins("thigh")
+    if thighs[:, (0, 2)].any():
+        raise ValueError(
+            f"{robot.urdf_file}: origins of the thigh links: found {thighs.tolist()}, expected y only"
+        )
+    thigh, calf = length("calf"), length("foot")
+    return LegGeometry(
+        hips=to_array(None, origins("hip")),
+        lateral=to_array(None, thighs[:, 1]),
+        links=to_array(None, [-thigh, -calf]),
+        thigh=thigh,
+        calf=calf,
+        knees=to_array(None, np.sign(robot.nominal_q[2::3])),
+    )
+
+
+# Leftover: the AlienGo's numbers as constants, until every user takes a `Robot`.
+ALIENGO = load_robot("aliengo")
+NOMINAL_Q, LIE_Q = ALIENGO.nominal_q, ALIENGO.lie_q
+NOMINAL_HEIGHT, LIE_HEIGHT = ALIENGO.nominal_height, ALIENGO.lie_height
+SUSPENDED_HEIGHT = ALIENGO.suspended_height
+KP, KD = ALIENGO.kp, ALIENGO.kd
+LOWER, UPPER = ALIENGO.lower, ALIENGO.upper
+COMMAND_LOWER, COMMAND_UPPER = ALIENGO.command_lower, ALIENGO.command_upper
+TORQUE_LIMIT, VELOCITY_LIMIT = ALIENGO.torque_limit, ALIENGO.velocity_limit
+ARMATURE, FRICTION, DAMPING = ALIENGO.armature, ALIENGO.joint_friction, ALIENGO.joint_damping
+FOOT_RADIUS, MASS, LINKS = ALIENGO.foot_radius, ALIENGO.mass, ALIENGO.links
+combined_inertial = ALIENGO.combined_inertial

@@ -1,19 +1,25 @@
-"""Generator of the URDF file: `python -m quadvel_description.urdf_generator` writes it.
+"""URDF of a robot from its MJCF, for robots whose maker publishes no usable URDF.
 
-Links, inertias and limits come from `robot`, shapes from the MJCF. The simulation uses the MJCF.
+`python -m quadvel_description.urdf_generator FOLDER` writes `robot.urdf` from `robot.xml`; limits of
+torque and speed come from `robot.yaml`. The simulation uses the MJCF.
 """
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Mapping
+from pathlib import Path
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
-from . import robot
-from .frames import BASE
-from .mjcf import Plant, load_model
-from .urdf import FILE
+from .bounded_yaml import read_yaml
+from .quadruped import JOINT_NAMES
+from .urdf import ROOT
+
+Element = ElementTree.Element
+_INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
 def _text(*values: float) -> str:
@@ -30,91 +36,97 @@ def _rpy(quaternion: np.ndarray) -> np.ndarray:
     return np.array([np.arctan2(r[2, 1], r[2, 2]), pitch, np.arctan2(r[1, 0], r[0, 0])])
 
 
-def _add_inertial(element: ElementTree.Element, inertial: robot.Inertial) -> None:
-    """Add the inertia of a link."""
-    node = ElementTree.SubElement(element, "inertial")
-    ElementTree.SubElement(node, "origin", xyz=_text(*inertial.com), rpy="0 0 0")
-    ElementTree.SubElement(node, "mass", value=_text(inertial.mass))
-    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-    tensor = {name: _text(value) for name, value in zip(names, inertial.fullinertia(), strict=True)}
-    ElementTree.SubElement(node, "inertia", tensor)
+def _add_inertial(link: Element, body: mujoco.MjsBody) -> None:
+    """Add the inertia of a body, which its MJCF states in the axes of the body."""
+    full = body.fullinertia if np.isfinite(body.fullinertia[0]) else [*body.inertia, 0.0, 0.0, 0.0]
+    node = ElementTree.SubElement(link, "inertial")
+    ElementTree.SubElement(node, "origin", xyz=_text(*body.ipos), rpy="0 0 0")
+    ElementTree.SubElement(node, "mass", value=_text(body.mass))
+    ElementTree.SubElement(node, "inertia", dict(zip(_INERTIA, map(_text, full), strict=True)))
 
 
-def _add_shape(element: ElementTree.Element, model: mujoco.MjModel, geom: int, origin: np.ndarray) -> None:
-    """Add an MJCF geom as visual and collision of a link at `origin` in the geom's body."""
-    size = model.geom_size[geom]
+def _add_shape(link: Element, geom: mujoco.MjsGeom, model: mujoco.MjModel) -> None:
+    """Add a geom as visual and collision."""
+    size, quaternion = geom.size, model.geom_quat[geom.id]
     shape: tuple[str, dict[str, str]]
-    match int(model.geom_type[geom]):
+    match geom.type:
         case mujoco.mjtGeom.mjGEOM_BOX:
             shape = "box", {"size": _text(*(2 * size))}
-        case mujoco.mjtGeom.mjGEOM_CYLINDER:
+        case mujoco.mjtGeom.mjGEOM_CYLINDER | mujoco.mjtGeom.mjGEOM_CAPSULE:
             shape = "cylinder", {"radius": _text(size[0]), "length": _text(2 * size[1])}
         case mujoco.mjtGeom.mjGEOM_SPHERE:
             shape = "sphere", {"radius": _text(size[0])}
         case other:
-            raise ValueError(
-                f"geom {model.geom(geom).name!r}: found type {other}, expected box, cylinder or sphere"
-            )
+            raise ValueError(f"geom {geom.name!r}: found {other}, expected box, capsule, cylinder or sphere")
     for role in ("visual", "collision"):
-        node = ElementTree.SubElement(element, role)
-        position = model.geom_pos[geom] - origin
-        ElementTree.SubElement(node, "origin", xyz=_text(*position), rpy=_text(*_rpy(model.geom_quat[geom])))
+        node = ElementTree.SubElement(link, role)
+        ElementTree.SubElement(node, "origin", xyz=_text(*geom.pos), rpy=_text(*_rpy(quaternion)))
         ElementTree.SubElement(ElementTree.SubElement(node, "geometry"), shape[0], shape[1])
         if role == "visual":
-            colour = _text(*np.round(model.geom_rgba[geom].astype(float), 3))
+            colour = _text(*np.round(geom.rgba.astype(float), 3))
             material = ElementTree.SubElement(node, "material", name=f"rgba {colour}")
             ElementTree.SubElement(material, "color", rgba=colour)
 
 
-def _add_link(parent: ElementTree.Element, link: robot.Link, model: mujoco.MjModel) -> None:
-    """Add a link with inertia and shapes."""
-    element = ElementTree.SubElement(parent, "link", name=link.name)
-    _add_inertial(element, link.inertial)
-    for geom in range(model.ngeom):
-        body = model.body(model.geom_bodyid[geom]).name
-        owner = model.geom(geom).name or body  # a foot is a link here, and a geom of the calf there
-        if owner == link.name:
-            _add_shape(element, model, geom, np.zeros(3) if body == owner else np.array(link.origin))
+def _add_joint(
+    tree: Element,
+    child: str,
+    parent: str,
+    origin: np.ndarray,
+    joint: mujoco.MjsJoint | None,
+    limits: Mapping[str, str],
+) -> None:
+    """Add the joint between a link and its parent: revolute, or fixed without `joint`."""
+    name = joint.name if joint else f"{child}_fixed"
+    element = ElementTree.SubElement(tree, "joint", name=name, type="revolute" if joint else "fixed")
+    ElementTree.SubElement(element, "parent", link=parent)
+    ElementTree.SubElement(element, "child", link=child)
+    ElementTree.SubElement(element, "origin", xyz=_text(*origin), rpy="0 0 0")
+    if joint:
+        lower, upper = map(_text, joint.range)
+        ElementTree.SubElement(element, "axis", xyz=_text(*joint.axis))
+        ElementTree.SubElement(element, "limit", {"lower": lower, "upper": upper, **limits})
 
 
-def _add_joint(parent: ElementTree.Element, link: robot.Link) -> None:
-    """Add the joint between `link` and its parent: revolute (joint table) or fixed."""
-    name = f"{link.name}_joint" if link.axis else f"{link.name}_fixed"
-    element = ElementTree.SubElement(parent, "joint", name=name, type="revolute" if link.axis else "fixed")
-    ElementTree.SubElement(element, "parent", link=link.parent or BASE)
-    ElementTree.SubElement(element, "child", link=link.name)
-    ElementTree.SubElement(element, "origin", xyz=_text(*link.origin), rpy="0 0 0")
-    if link.axis:
-        i = robot.JOINT_NAMES.index(name)
-        ElementTree.SubElement(element, "axis", xyz={"x": "1 0 0", "y": "0 1 0"}[link.axis])
-        ElementTree.SubElement(
-            element,
-            "limit",
-            lower=_text(robot.LOWER[i]),
-            upper=_text(robot.UPPER[i]),
-            effort=_text(robot.TORQUE_LIMIT[i]),
-            velocity=_text(robot.VELOCITY_LIMIT[i]),
-        )
-        ElementTree.SubElement(
-            element, "dynamics", damping=_text(robot.DAMPING[i]), friction=_text(robot.FRICTION[i])
-        )
+def generate_urdf(folder: Path) -> str:
+    """Generate the URDF of a robot: root link `base_link`, then the bodies of its MJCF.
 
-
-def generate_urdf() -> str:
-    """Generate the URDF: root link `base_link` with the trunk; joints as in `robot.JOINT_NAMES`.
+    Args:
+        folder: Folder of the robot.
 
     Returns:
         URDF text.
     """
-    model = load_model(Plant(plane=False))
-    root = ElementTree.Element("robot", name="aliengo")
-    ElementTree.SubElement(root, "link", name=BASE)
-    for link in robot.LINKS:
-        _add_link(root, link, model)
-        _add_joint(root, link)
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+    numbers = read_yaml(folder / "robot.yaml", "a YAML file of a robot")
+    spec = mujoco.MjSpec.from_file(str(folder / "robot.xml"))
+    model = spec.compile()
+    tree = Element("robot", name=numbers["name"])
+    ElementTree.SubElement(tree, "link", name=ROOT)
+    for body in spec.bodies[1:]:
+        link = ElementTree.SubElement(tree, "link", name=body.name)
+        _add_inertial(link, body)
+        for geom in body.geoms:
+            _add_shape(link, geom, model)
+        parent = body.parent.name
+        moving = [joint for joint in body.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE]
+        joint, limits = None, {}
+        if moving:
+            joint = moving[0]
+            effort, velocity = (
+                np.resize(numbers[name], len(JOINT_NAMES))[JOINT_NAMES.index(joint.name)]
+                for name in ("torque_limit", "velocity_limit")
+            )
+            limits = {"effort": _text(effort), "velocity": _text(velocity)}
+        root = parent == "world"
+        origin = np.zeros(3) if root else body.pos
+        _add_joint(tree, body.name, ROOT if root else parent, origin, joint, limits)
+    for site in spec.sites:
+        if site.name == "imu":
+            ElementTree.SubElement(tree, "link", name="imu_link")
+            _add_joint(tree, "imu_link", site.parent.name, site.pos, None, {})
+    ElementTree.indent(tree)
+    return ElementTree.tostring(tree, encoding="unicode", xml_declaration=True) + "\n"
 
 
 if __name__ == "__main__":
-    FILE.write_text(generate_urdf(), encoding="utf-8")
+    (Path(sys.argv[1]) / "robot.urdf").write_text(generate_urdf(Path(sys.argv[1])), encoding="utf-8")

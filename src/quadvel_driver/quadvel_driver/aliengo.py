@@ -1,6 +1,7 @@
 """The AlienGo for its driver."""
 
-from quadvel_description.robot import COMMAND_LOWER, COMMAND_UPPER, JOINT_NAMES, TORQUE_LIMIT, VELOCITY_LIMIT
+from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import COMMAND_LOWER, COMMAND_UPPER, TORQUE_LIMIT, VELOCITY_LIMIT
 
 from .driven_robot import DrivenRobot
 

@@ -16,7 +16,7 @@ import yaml
 from quadvel_description.arrays import Array
 from quadvel_description.bounded_yaml import read_yaml
 from quadvel_description.kinematics import rotate, rotate_inverse
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.state import JointCommand, RobotState
 
 SCHEMA = 1

@@ -20,6 +20,8 @@ from scipy.optimize import least_squares
 from quadvel_description import robot
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.kinematics import foot_positions, rotate, rotate_inverse
+from quadvel_description.quadruped import GRAVITY, JOINT_NAMES, KINDS, LEGS
+from quadvel_description.robot import ALIENGO
 from quadvel_description.state import RobotState
 
 from .calibration import Calibration
@@ -138,11 +140,11 @@ def holding_torque(q: Array, down: Array) -> Array:
 
 def _leg_torque(q: Array, down: Array, leg: int) -> Array:
     """Return the holding torque of one leg, (n, 3), N m."""
-    (joints, centres), axes, masses = _leg_masses(q, robot.LEGS[leg])
+    (joints, centres), axes, masses = _leg_masses(q, LEGS[leg])
     torque = np.zeros_like(q)
     for joint in range(3):
         for body in range(joint, 3):
-            moment = np.cross(centres[body] - joints[joint], masses[body] * robot.GRAVITY * down)
+            moment = np.cross(centres[body] - joints[joint], masses[body] * GRAVITY * down)
             torque[:, joint] -= (axes[joint] * moment).sum(axis=1)
     return torque
 
@@ -151,7 +153,7 @@ def _leg_masses(q: Array, leg: str) -> tuple[tuple[list[Array], list[Array]], li
     """Return joint positions and centres of mass (n, 3) m, joint axes (n, 3) and masses (kg) of a leg, trunk frame."""
     position, rotation = np.zeros((len(q), 3)), np.broadcast_to(np.eye(3), (len(q), 3, 3))
     joints, centres, axes, masses = [], [], [], []
-    for k, kind in enumerate(robot.KINDS):
+    for k, kind in enumerate(KINDS):
         link = next(link for link in robot.LINKS if link.name == f"{leg}_{kind}")
         body = robot.combined_inertial(link.name)
         position = position + rotation @ np.array(link.origin)
@@ -244,7 +246,7 @@ def _imu_mounting(standing: Samples, calibration: Calibration) -> tuple[Array, f
     The tilt is the rotation from the vertical that the IMU shows to the normal of the plane of the
     feet (the singular vector of the smallest singular value of the centred foot positions).
     """
-    feet = foot_positions(standing.q - calibration.joint_zeros).mean(axis=0)
+    feet = foot_positions(ALIENGO, standing.q - calibration.joint_zeros).mean(axis=0)
     centred = feet - feet.mean(axis=0)
     normal = np.linalg.svd(centred)[2][2]
     normal = normal * np.sign(normal[2])
@@ -258,7 +260,7 @@ def _imu_mounting(standing: Samples, calibration: Calibration) -> tuple[Array, f
 
 def _check_suspended(suspended: Samples) -> None:
     """Raise CalibrationDataError if a joint does not move in both directions."""
-    for i, name in enumerate(robot.JOINT_NAMES):
+    for i, name in enumerate(JOINT_NAMES):
         moving = suspended.dq[:, i]
         if min((moving > MIN_MOVING_SPEED).sum(), (moving < -MIN_MOVING_SPEED).sum()) < MIN_ROWS // 2:
             raise CalibrationDataError(

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadvel_description.arrays import Array
-from quadvel_description.robot import JOINT_NAMES, LEGS
+from quadvel_description.quadruped import JOINT_NAMES, LEGS
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 
 from .board_state import BoardState

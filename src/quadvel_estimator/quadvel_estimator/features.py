@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from quadvel_description.arrays import Array
 from quadvel_description.kinematics import rotation_matrix
 from quadvel_description.network_input import InputLayout, InputTerm
-from quadvel_description.robot import GRAVITY, JOINT_NAMES, NOMINAL_Q
+from quadvel_description.quadruped import GRAVITY, JOINT_NAMES
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import MODE_SERVO, RobotState
 
 from .odometry import leg_velocity

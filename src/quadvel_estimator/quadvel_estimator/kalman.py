@@ -24,7 +24,8 @@ from numpy.typing import ArrayLike
 from quadvel_description.arrays import Array
 from quadvel_description.fields import field, positive
 from quadvel_description.kinematics import foot_kinematics, rotation_matrix
-from quadvel_description.robot import GRAVITY
+from quadvel_description.quadruped import GRAVITY
+from quadvel_description.robot import ALIENGO
 from quadvel_description.state import RobotState
 
 from .odometry import foot_velocity_in_trunk, rolling_velocity
@@ -173,7 +174,7 @@ class KalmanEstimator:
         contact of each foot (..., 4), and the trunk's acceleration (..., 3).
         """
         rotation = rotation_matrix(state.quaternion)
-        feet, jacobians = foot_kinematics(state.q)
+        feet, jacobians = foot_kinematics(ALIENGO, state.q)
         to_world = rotation.swapaxes(-1, -2)  # R^T, as vectors are rows: s_world = s_body R^T
         # With the foot s_i relative to the trunk, v = v_roll,i - d/dt (R s_i) for a planted foot.
         rolling = rolling_velocity(state, rotation) @ to_world

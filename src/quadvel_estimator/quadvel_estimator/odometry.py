@@ -10,7 +10,7 @@ import numpy as np
 
 from quadvel_description.arrays import Array
 from quadvel_description.kinematics import foot_kinematics
-from quadvel_description.robot import FOOT_RADIUS
+from quadvel_description.robot import ALIENGO, FOOT_RADIUS
 from quadvel_description.state import RobotState
 
 # (a @ CROSS).reshape(3, 3) is the matrix by which a row vector b becomes a x b.
@@ -29,7 +29,9 @@ def leg_velocity(state: RobotState, rotation: Array) -> Array:
     Returns:
         Velocity in the body frame, (..., 4, 3), m/s.
     """
-    return rolling_velocity(state, rotation) - foot_velocity_in_trunk(state, *foot_kinematics(state.q))
+    return rolling_velocity(state, rotation) - foot_velocity_in_trunk(
+        state, *foot_kinematics(ALIENGO, state.q)
+    )
 
 
 def rolling_velocity(state: RobotState, rotation: Array) -> Array:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from quadvel_description import robot
 from quadvel_description.arrays import Array, Bools, Indices
+from quadvel_description.quadruped import LEGS
 
 DIAGONAL_PAIRS = (("FR", "RL"), ("FL", "RR"))
 SIDE_PAIRS = (("FR", "RR"), ("FL", "RL"))
@@ -43,13 +43,13 @@ def contact_agreement(contact: Bools, pairs: tuple[tuple[str, str], ...]) -> flo
     """Return the share of time in which both feet of a pair are in the same contact state.
 
     Args:
-        contact: Contacts (n, 4), feet in the order of `robot.LEGS`.
+        contact: Contacts (n, 4), feet in the order of `LEGS`.
         pairs: Names of the legs of each pair.
 
     Returns:
         Mean share over the pairs, from 0 to 1.
     """
-    columns = [[robot.LEGS.index(leg) for leg in pair] for pair in pairs]
+    columns = [[LEGS.index(leg) for leg in pair] for pair in pairs]
     return float(np.mean([contact[:, one] == contact[:, other] for one, other in columns]))
 
 
@@ -76,7 +76,7 @@ class GaitKind:
         """Compute the figures of a steady walk.
 
         Args:
-            contact: Unfiltered contacts (n, 4), feet in the order of `robot.LEGS`.
+            contact: Unfiltered contacts (n, 4), feet in the order of `LEGS`.
             sideways: Lateral velocity of the trunk (n,), m/s, body frame, positive to the left.
             period: Sampling period, s.
 

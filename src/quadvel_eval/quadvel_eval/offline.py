@@ -16,7 +16,7 @@ from rich.table import Table
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.arrays import Array
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator

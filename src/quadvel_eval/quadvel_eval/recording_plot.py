@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from quadvel_description.arrays import Array
-from quadvel_description.robot import JOINT_NAMES, TORQUE_LIMIT
+from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import TORQUE_LIMIT
 from quadvel_recordings.joint_log import JointLog, read_joint_log
 from quadvel_recordings.output import atomic_write, output_folder
 from quadvel_recordings.reading import RecordingError, read_messages

@@ -17,7 +17,7 @@ from scipy.signal import savgol_filter
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_description.arrays import Array, Bools
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand
 from quadvel_nodes.messages import seconds
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile

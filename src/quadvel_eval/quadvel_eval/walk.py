@@ -18,6 +18,7 @@ from quadvel_description import robot
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.fields import field
 from quadvel_description.kinematics import rotate, yaw
+from quadvel_description.quadruped import GRAVITY
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
@@ -288,7 +289,7 @@ def cost_of_transport(power: float, mass: float, command: Array, mean: Array) ->
         pace = float(command[:2] @ mean[:2]) / speed
     else:
         pace = DIAGONAL_FOOT_DISTANCE_M * float(np.sign(command[2]) * mean[2])
-    return power / (mass * robot.GRAVITY * pace) if pace > 0.0 else None
+    return power / (mass * GRAVITY * pace) if pace > 0.0 else None
 
 
 def jitter(targets: ArrayLike) -> float:

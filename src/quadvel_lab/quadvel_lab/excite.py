@@ -27,6 +27,7 @@ from quadvel_bringup.processes import ProcessGroup, StopSignals
 from quadvel_bringup.stack import PARAMETERS
 from quadvel_description import robot
 from quadvel_description.kinematics import roll_pitch
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_eval.report import read_json
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
@@ -143,7 +144,7 @@ def _check(state: RobotState) -> None:
         raise MotionError(f"the trunk tilts by {tilt:.2f} rad, expected at most {MAX_TILT_RAD}")
     beyond = np.maximum(robot.LOWER - state.q, state.q - robot.UPPER)
     if beyond.max() > JOINT_MARGIN_RAD:
-        joint = robot.JOINT_NAMES[int(beyond.argmax())]
+        joint = JOINT_NAMES[int(beyond.argmax())]
         raise MotionError(f"{joint} is {beyond.max():.2f} rad beyond its range")
 
 

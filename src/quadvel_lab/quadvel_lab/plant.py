@@ -22,6 +22,7 @@ from quadvel_description import robot
 from quadvel_description.arrays import Array
 from quadvel_description.bounded_yaml import read_yaml
 from quadvel_description.fields import field
+from quadvel_description.quadruped import joint_index
 from quadvel_description.records import structure_record
 from quadvel_description.state import RobotState
 from quadvel_sim.config import SimulatorConfig
@@ -270,7 +271,7 @@ def _by_joint(path: Path, name: str, value: Any) -> Any:
         return value
     numbers = np.zeros(12)
     try:
-        numbers[robot.joint_index(list(value))] = list(value.values())
+        numbers[joint_index(list(value))] = list(value.values())
     except ValueError as error:
         raise ValueError(f"{path}: {name}: {error}") from None
     return numbers

@@ -17,11 +17,11 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from quadvel_description import robot
 from quadvel_description.arrays import Array
 from quadvel_description.frames import IMU, FramePose, fixed_links, moving_links
+from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import ALIENGO
 from quadvel_description.state import RobotState
-from quadvel_description.urdf import urdf
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -53,7 +53,7 @@ class RobotView:
         ]
         stamp = node.get_clock().now().to_msg()
         self._latched[0].publish(TFMessage(transforms=transform_messages(stamp, fixed_links())))
-        self._latched[1].publish(String(data=urdf()))
+        self._latched[1].publish(String(data=ALIENGO.urdf_file.read_text(encoding="utf-8")))
 
     def publish(self, stamp: Any, state: RobotState) -> None:
         """Publish one state on the topics to which somebody subscribes.
@@ -63,7 +63,7 @@ class RobotView:
             state: The state.
         """
         if self._joint_states.get_subscription_count():
-            joints = JointState(name=list(robot.JOINT_NAMES))
+            joints = JointState(name=list(JOINT_NAMES))
             joints.header.stamp = stamp
             joints.position, joints.velocity = state.q.tolist(), state.dq.tolist()
             joints.effort = state.tau.tolist()

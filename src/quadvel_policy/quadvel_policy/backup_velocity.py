@@ -11,7 +11,7 @@ import numpy as np
 
 from quadvel_description.arrays import Array
 from quadvel_description.kinematics import rotate_inverse
-from quadvel_description.robot import GRAVITY
+from quadvel_description.quadruped import GRAVITY
 from quadvel_description.state import RobotState
 
 REST_ACCELERATION = np.array([0.0, 0.0, GRAVITY])

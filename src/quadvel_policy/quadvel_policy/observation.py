@@ -19,8 +19,9 @@ from quadvel_description.arrays import Array
 from quadvel_description.kinematics import roll_pitch as roll_pitch_of
 from quadvel_description.network_input import InputLayout as ObservationSpec
 from quadvel_description.network_input import InputTerm as ObservationTerm
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.recurrent_network import SCHEMA
-from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.robot_name import UNNAMED_ROBOT
 
 RATE_HZ = 200.0

@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Array
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 
 from .config import SupervisorConfig
 from .guard import MOVING_MODES, Finding, Level

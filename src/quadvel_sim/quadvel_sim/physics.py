@@ -9,8 +9,8 @@ from __future__ import annotations
 import attrs
 import mujoco
 
-from quadvel_description import robot
 from quadvel_description.fields import field
+from quadvel_description.quadruped import LEGS
 
 CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
 
@@ -48,7 +48,7 @@ class Physics:
             return
         model.opt.timestep /= self.substeps
         model.opt.cone = CONES[self.cone]
-        for leg in robot.LEGS:
+        for leg in LEGS:
             foot = model.geom(f"{leg}_foot")
             foot.solref[:] = self.contact_time, self.contact_damping
             if self.torsional_friction:

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadvel_actuator import ActuatorModel
-from quadvel_description import robot
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.kinematics import rotate, rotate_inverse
 from quadvel_description.mjcf import Plant, build_spec
+from quadvel_description.quadruped import LEGS, joint_index
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_sim import persons
 from quadvel_sim.config import SensorNoise, SimulatorConfig
@@ -116,10 +116,10 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
         trunk.mass *= share
         trunk.fullinertia *= share
     model = spec.compile()
-    for leg, friction in zip(robot.LEGS, config.friction, strict=True):
+    for leg, friction in zip(LEGS, config.friction, strict=True):
         model.geom(f"{leg}_foot").friction[0] = friction
     config.physics.apply(model)
-    foot, own = model.geom(f"{robot.LEGS[0]}_foot"), model.geom_priority == SURFACE_PRIORITY
+    foot, own = model.geom(f"{LEGS[0]}_foot"), model.geom_priority == SURFACE_PRIORITY
     # A surface differs from the feet in its friction only.
     model.geom_solref[own], model.geom_condim[own] = foot.solref, foot.condim
     disable = mujoco.mjtDisableBit
@@ -155,7 +155,7 @@ class Simulator:
         self.model = build_model(self.config)
         self.data = mujoco.MjData(self.model)
         self._q, self._dq = self.data.qpos[7:], self.data.qvel[6:]  # views of the live arrays
-        self._foot_of_geom = {self.model.geom(f"{leg}_foot").id: i for i, leg in enumerate(robot.LEGS)}
+        self._foot_of_geom = {self.model.geom(f"{leg}_foot").id: i for i, leg in enumerate(LEGS)}
         self._orientation, self._gyro, self._accelerometer = (
             slice(adr := self.model.sensor(name).adr.item(), adr + self.model.sensor(name).dim.item())
             for name in ("orientation", "gyro", "accelerometer")
@@ -332,7 +332,7 @@ class Simulator:
         Raises:
             ValueError: The joint is unknown.
         """
-        self._failed_joints += robot.joint_index([name])
+        self._failed_joints += joint_index([name])
 
     def jam_joint(self, name: str) -> None:
         """Jam a joint by friction until the next reset; as MuJoCo's friction is soft, it still creeps.
@@ -343,7 +343,7 @@ class Simulator:
         Raises:
             ValueError: The joint is unknown.
         """
-        (joint,) = robot.joint_index([name])
+        (joint,) = joint_index([name])
         self.model.dof_frictionloss[6 + joint] = _JAM_TORQUE
 
     def _apply_pushes(self) -> None:

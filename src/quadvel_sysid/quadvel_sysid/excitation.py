@@ -19,13 +19,14 @@ from typing_extensions import override
 from quadvel_description import robot
 from quadvel_description.arrays import Array
 from quadvel_description.command_range import clip_to_command_range
-from quadvel_description.kinematics import HIPS, foot_jacobians, inverse_kinematics
+from quadvel_description.kinematics import foot_jacobians, inverse_kinematics
+from quadvel_description.quadruped import GRAVITY
+from quadvel_description.robot import ALIENGO
 
 PERIOD_S = 0.001
 """s between two targets."""
 MAX_TORQUE_SHARE = 0.7
 """Share of the torque limit that a target may request."""
-_SIDE = np.array([robot.LEFT[leg] for leg in robot.LEGS], float)
 _FOOT_HEIGHT_M = -0.4
 """m; height of the feet relative to the hips, standing."""
 _LEG_PHASE = np.array([0.0, 2.0, 2.0, 0.0])
@@ -118,18 +119,18 @@ class OnGround(Excitation):
     def _joint_targets(self, t: Array) -> Array:
         share, height = self._foot_lift(t)
         feet = np.empty((len(t), 4, 3))
-        feet[...] = HIPS
-        feet[..., 1] += robot.THIGH_OFFSET * _SIDE
+        feet[...] = ALIENGO.legs.hips
+        feet[..., 1] += ALIENGO.legs.lateral
         feet[..., 2] = _FOOT_HEIGHT_M + height[:, None] * share
-        return inverse_kinematics(feet)
+        return inverse_kinematics(ALIENGO, feet)
 
     @override
     def support_torque(self) -> Array:
         # Virtual work: the foot force f_z = m g share gives the torque -J_z^T f_z. The share of a foot
         # falls linearly with its lift.
         down = 1.0 - self._foot_lift(self._times())[0]
-        force = robot.MASS * robot.GRAVITY * down / down.sum(axis=1, keepdims=True)
-        jacobians = foot_jacobians(self._joint_targets(self._times()))
+        force = robot.MASS * GRAVITY * down / down.sum(axis=1, keepdims=True)
+        jacobians = foot_jacobians(ALIENGO, self._joint_targets(self._times()))
         return -(jacobians[:, :, 2] * force[..., None]).reshape(-1, 12)
 
 

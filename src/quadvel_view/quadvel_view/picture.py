@@ -12,6 +12,8 @@ import numpy as np
 from quadvel_description import robot
 from quadvel_description.arrays import Array
 from quadvel_description.kinematics import foot_positions, rotate
+from quadvel_description.quadruped import joint_index
+from quadvel_description.robot import ALIENGO
 
 TOPICS = {
     "/joint_states": "sensor_msgs/msg/JointState",
@@ -222,7 +224,7 @@ class RobotPicture:
         Returns:
             Height of the ground in the frame odom, m, and height of the foot above it, m.
         """
-        feet = rotate(self.quaternion, foot_positions(self.q)) + self.position
+        feet = rotate(self.quaternion, foot_positions(ALIENGO, self.q)) + self.position
         x, y, z = feet[feet[:, 2].argmin()]
         floor = 0.0 if self.ground is None else self.ground.height(x, y)
         return floor, float(z) - robot.FOOT_RADIUS - floor
@@ -252,7 +254,7 @@ class RobotPicture:
 
     def _joint_states(self, message: Any, now: float) -> None:
         """Update angles and torques."""
-        order = robot.joint_index(message.name)
+        order = joint_index(message.name)
         self.q[order] = _finite("position", message.position)
         self.torque[order] = message.effort if len(message.effort) == len(order) else np.nan
 

@@ -17,7 +17,6 @@ import viser
 from quadvel_description import robot
 from quadvel_description.arrays import Array
 from quadvel_description.frames import moving_links
-from quadvel_description.urdf import urdf
 
 from .picture import Ground, Person, RobotPicture
 
@@ -192,7 +191,7 @@ def robot_shapes() -> Iterator[Shape]:
     Yields:
         One shape per visual element.
     """
-    for link in ElementTree.fromstring(urdf()).iter("link"):
+    for link in ElementTree.parse(robot.ALIENGO.urdf_file).iter("link"):
         for visual in link.iter("visual"):
             geometry = visual.find("geometry/*")
             assert geometry is not None

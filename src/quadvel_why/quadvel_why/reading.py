@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from quadvel_description.arrays import Array, Floats, Indices
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.state import MODE_DAMPING
 from quadvel_eval.recording import Series, planar
 from quadvel_nodes.messages import seconds

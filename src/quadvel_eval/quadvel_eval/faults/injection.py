@@ -10,7 +10,7 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Array, Bools
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.state import RobotState
 from quadvel_sim.simulator import DT
 

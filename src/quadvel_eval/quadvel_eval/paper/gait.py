@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from scipy.ndimage import median_filter
 from typing_extensions import override
 
-from quadvel_description import robot
 from quadvel_description.arrays import Array, Bools
+from quadvel_description.quadruped import LEGS
 
 from ..gait_kind import GaitKind, gait_frequency
 from ..robot_loop import CONTROL_PERIOD_S
@@ -130,7 +130,7 @@ class Gait(Section):
             part = slice(max(0, i - half), i + half)
             window = contact[part]
             kind = GaitKind.of(walk.contact[part], walk.velocity[part, 1], CONTROL_PERIOD_S)
-            feet = {leg: int(contact[i, robot.LEGS.index(leg)]) for leg in SHOWN_LEGS}
+            feet = {leg: int(contact[i, LEGS.index(leg)]) for leg in SHOWN_LEGS}
             lines.append(
                 {
                     "time": round(float(walk.time[i]), 3),

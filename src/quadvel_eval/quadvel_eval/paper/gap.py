@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from quadvel_actuator import ActuatorParameters, Effect
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_recordings.output import atomic_write
 
 from .cells import Command, cell_record, command_limits, count_falls, largest_error, mean_error

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from quadvel_description import robot
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
@@ -86,7 +87,7 @@ class RecordingSimulator(Simulator):
             np.array([getattr(c, field) for c in commands]) for field in ("q", "tau", "kp", "kd")
         )
         valid = np.ones(q.shape, bool)
-        return Log(name, robot.JOINT_NAMES, t, q, dq, t, q_des, valid, tau=tau, tau_ff=tau_ff, kp=kp, kd=kd)
+        return Log(name, JOINT_NAMES, t, q, dq, t, q_des, valid, tau=tau, tau_ff=tau_ff, kp=kp, kd=kd)
 
 
 def record_foot_lifting(seed: int, seconds: float) -> Log:

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from quadvel_description import robot
 from quadvel_description.arrays import Array, Indices
+from quadvel_description.quadruped import LEFT, LEGS
 from quadvel_description.symmetry import JOINTS as MIRROR
 
 from ..gait_kind import touchdowns
@@ -72,11 +72,11 @@ def leg_curves(walk: Walk, leg: str) -> dict[str, Array] | None:
         (PHASES_PER_CYCLE, 3) from touchdown on; None without two full cycles.
     """
     late = walk.time >= SETTLING_TIME_S
-    i = robot.LEGS.index(leg)
+    i = LEGS.index(leg)
     down = touchdowns(debounce_contacts(walk.contact[late])[:, i])
     if len(down) < 3:
         return None
-    sign = np.ones(3) if robot.LEFT[leg] > 0 else MIRROR.sign[3 * i : 3 * i + 3]
+    sign = np.ones(3) if LEFT[leg] > 0 else MIRROR.sign[3 * i : 3 * i + 3]
     joints = slice(3 * i, 3 * i + 3)
     torque, velocity, target = (
         resample_cycles(down, series[late][:, joints] * sign)
@@ -143,7 +143,7 @@ class Symmetry(Section):
     def to_records(self, answers: JobResults) -> list[Record]:
         records: list[Record] = []
         for labels, walk in answers:
-            for leg in robot.LEGS if walk is not None else ():
+            for leg in LEGS if walk is not None else ():
                 curves = leg_curves(walk, leg)
                 if curves is not None:
                     records += [

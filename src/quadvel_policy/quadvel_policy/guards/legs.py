@@ -7,7 +7,8 @@ import math
 import numpy as np
 from typing_extensions import override
 
-from quadvel_description.robot import JOINT_NAMES, LEGS, LOWER, TORQUE_LIMIT, UPPER
+from quadvel_description.quadruped import JOINT_NAMES, LEGS
+from quadvel_description.robot import LOWER, TORQUE_LIMIT, UPPER
 from quadvel_description.state import MODE_DAMPING
 
 from ..guard import MOVING_MODES, WALK_MODES, Guard, GuardInput, Level

@@ -9,7 +9,7 @@ from typing_extensions import override
 
 from quadvel_description.arrays import Array
 from quadvel_description.kinematics import rotate_one
-from quadvel_description.robot import GRAVITY
+from quadvel_description.quadruped import GRAVITY
 
 from ..guard import MOVING_MODES, Guard, GuardInput, Level
 from .legs import NOTABLE_MOTION_RAD

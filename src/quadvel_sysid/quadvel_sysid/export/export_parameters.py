@@ -11,7 +11,7 @@ import numpy as np
 from quadvel_actuator.effects.basis_regressors import LEARNED_RESIDUAL
 from quadvel_actuator.parameters import ActuatorParameters, DelayPair, Effect
 from quadvel_description.arrays import Array, Bools
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 
 from ..data.split import DataSplit
 from ..model.applied_effect import AppliedEffect

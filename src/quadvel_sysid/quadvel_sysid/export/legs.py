@@ -26,6 +26,7 @@ from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf
 from quadvel_description.arrays import Array, Bools
+from quadvel_description.robot import shipped_robots
 
 from ..data.log_signals import as_double
 from ..logs.log import Log, LogError
@@ -150,10 +151,10 @@ class Legs:
 
 def _load_robot(robot: str) -> mujoco.MjModel:
     """Load a shipped description, or a file."""
-    shipped = _SHIPPED / f"{robot}.xml"
+    shipped = _SHIPPED / robot / "robot.xml"
     path = shipped if shipped.is_file() else Path(robot)
     if not path.is_file():
-        names = ", ".join(["aliengo", *(one.stem for one in sorted(_SHIPPED.glob("*.xml")))])
+        names = ", ".join(shipped_robots())
         raise FileNotFoundError(f"--robot: found {robot}, expected {names} or an MJCF or URDF file")
     try:
         return mujoco.MjModel.from_xml_path(str(path))

@@ -7,7 +7,8 @@ import numpy as np
 from typing_extensions import override
 
 from quadvel_description.arrays import Array, Bools
-from quadvel_description.robot import KINDS, TORQUE_LIMIT
+from quadvel_description.quadruped import KINDS
+from quadvel_description.robot import TORQUE_LIMIT
 
 from ..cause import NOTHING, Cause, Link, Measurement, Trace, worst_span
 from ..signals import Signals

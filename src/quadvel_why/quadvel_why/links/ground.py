@@ -6,7 +6,8 @@ import numpy as np
 from typing_extensions import override
 
 from quadvel_description.arrays import Array
-from quadvel_description.robot import GRAVITY, MASS
+from quadvel_description.quadruped import GRAVITY
+from quadvel_description.robot import MASS
 
 from ..cause import Cause, Link, Measurement, Trace, worst_span
 from ..legs import Legs

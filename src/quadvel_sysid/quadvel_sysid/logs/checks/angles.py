@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Bools, Floats
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 
 from ..findings import Finding, Kind, format_names
 from ..log import Log

@@ -8,7 +8,8 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Floats, Indices
-from quadvel_description.robot import JOINT_NAMES, LOWER, UPPER
+from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import LOWER, UPPER
 
 from ..findings import Finding, format_names
 from ..log import Log

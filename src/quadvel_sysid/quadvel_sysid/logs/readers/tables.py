@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from quadvel_description.arrays import Bools, Floats
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.quadruped import JOINT_NAMES
 
 from ..log import Log, LogError, joint_name
 from .columns import ColumnMap, read_fields
