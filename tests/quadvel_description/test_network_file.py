@@ -132,7 +132,7 @@ def test_what_is_more_than_numbers_is_refused_by_name(tmp_path: Path, change: Ch
     with pytest.raises(NetworkFileError, match=rf"hostile\.onnx: .*{sentence}"):
         read_network(tmp_path / "hostile.onnx")
     with pytest.raises(NetworkFileError, match=rf"hostile\.onnx: .*{sentence}"):
-        RecurrentNetwork(tmp_path / "hostile.onnx", {"y": 4})
+        RecurrentNetwork(tmp_path / "hostile.onnx", "aliengo", {"y": 4})
 
 
 def zipped(path: Path) -> None:
@@ -204,4 +204,4 @@ def test_a_memory_that_would_fill_the_machine_is_refused(tmp_path: Path) -> None
     helper.set_model_props(model, {"quadvel": json.dumps(metadata)})
     onnx.save(model, tmp_path / "vast.onnx")
     with pytest.raises(NetworkFileError, match=r"shape of input h_in is .* expected 'at most 10000 numbers'"):
-        RecurrentNetwork(tmp_path / "vast.onnx", {"y": 4})
+        RecurrentNetwork(tmp_path / "vast.onnx", "aliengo", {"y": 4})

@@ -80,6 +80,7 @@ def test_a_file_that_is_no_network_is_refused_by_name(tmp_path: Path) -> None:
         ({"kind": "policy"}, "metadata field kind is 'policy', expected 'velocity_estimator'"),
         ({"schema": 2}, "metadata field schema is 2, expected 1"),
         ({"rate_hz": 50}, "metadata field rate_hz is 50, expected 200"),
+        ({"robot": "go2"}, "metadata field robot is 'go2', expected 'aliengo'"),
         ({"joint_names": ["a_joint", *JOINT_NAMES[1:]]}, "metadata field joint_names is ['a_joint'"),
         ({"nominal_q": [0.0] * 12}, "metadata field nominal_q is [0.0"),
         ({"state_shape": [1, 1, 8]}, "shape of input h_in is [1, 1, 3], expected [1, 1, 8]"),

@@ -21,6 +21,7 @@ class StandingPolicy:
 
     def __init__(self) -> None:
         self.metadata = PolicyMetadata(
+            robot="aliengo",
             action_offset=tuple(
                 ALIENGO.nominal_q + mjcf.gravity_torque(mjcf.load_model(ALIENGO)) / ALIENGO.kp
             ),

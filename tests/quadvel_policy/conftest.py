@@ -33,6 +33,7 @@ HIDDEN = 8
 
 def make_metadata(**changes: Any) -> PolicyMetadata:
     fields: dict[str, Any] = {
+        "robot": "aliengo",
         "action_offset": tuple(NOMINAL_Q + 0.1),
         "action_scale": 0.25,
         "kp": KP,

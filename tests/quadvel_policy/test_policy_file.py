@@ -118,6 +118,7 @@ def test_a_network_of_another_form_is_refused(
 @pytest.mark.parametrize(
     ("field", "value", "sentence"),
     [
+        ("robot", "go2", "robot is 'go2', expected 'aliengo'"),
         ("joint_names", ["a"] * 12, "joint_names"),
         ("rate_hz", 50.0, "rate_hz is 50.0, expected 200.0"),
         ("kp", "stiff", "kp is 'stiff'"),
@@ -130,3 +131,11 @@ def test_metadata_that_does_not_fit_is_refused_with_the_files_name(
     text = json.dumps(json.loads(metadata.to_json()) | {field: value})
     with pytest.raises(NetworkFileError, match=rf"policy\.onnx: .*{sentence}"):
         PolicyFile(write_policy(properties={"quadvel": text}))
+
+
+def test_a_policy_without_a_name_is_that_of_the_aliengo(
+    write_policy: WritePolicy, metadata: PolicyMetadata
+) -> None:
+    fields = json.loads(metadata.to_json())
+    del fields["robot"]
+    assert PolicyFile(write_policy(properties={"quadvel": json.dumps(fields)})).metadata.robot == "aliengo"

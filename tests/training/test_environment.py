@@ -23,7 +23,9 @@ from quadvel_training.rewards import RewardWeights, Table2  # noqa: E402
 from tests.helpers.robots import ALIENGO  # noqa: E402
 
 STANDING = CommandRange(stance=1.0, hold=(100.0, 100.0))
-QUIET = EnvConfig(robot=ALIENGO, n=4, threads=1, seed=3, randomisation=Randomisation.none(), commands=STANDING)
+QUIET = EnvConfig(
+    robot=ALIENGO, n=4, threads=1, seed=3, randomisation=Randomisation.none(), commands=STANDING
+)
 
 
 def stand(env):

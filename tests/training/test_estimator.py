@@ -86,7 +86,9 @@ def test_what_the_policy_asks_for_fades_in(monkeypatch):
 def test_robots_that_lie_stand_up(monkeypatch, actor):
     only(monkeypatch, Mode.DAMPING)
     monkeypatch.setattr(walks, "MAX_MODE_S", walks.MIN_MODE_S)  # stance after 0.2 + 0.8 + 1.2 s
-    env = VelocityEnv(EnvConfig(robot=ALIENGO, n=3, threads=1, seed=1, randomisation=Randomisation.none(), commands=STILL))
+    env = VelocityEnv(
+        EnvConfig(robot=ALIENGO, n=3, threads=1, seed=1, randomisation=Randomisation.none(), commands=STILL)
+    )
     walking = Walks(env, actor)
     assert env.height.max() < ALIENGO.lie_height + 0.1
     assert (walking.previous_action == 0.0).all()
@@ -99,7 +101,9 @@ def test_robots_that_lie_stand_up(monkeypatch, actor):
 
 def test_readings_are_the_truth_but_for_noise_and_bias(monkeypatch, actor):
     only(monkeypatch, Mode.STANCE)
-    env = VelocityEnv(EnvConfig(robot=ALIENGO, n=400, seed=1, randomisation=Randomisation.none(), commands=STILL))
+    env = VelocityEnv(
+        EnvConfig(robot=ALIENGO, n=400, seed=1, randomisation=Randomisation.none(), commands=STILL)
+    )
     walking = Walks(env, actor)
     sensed = walking.sense()
     scale = np.sqrt(

@@ -32,7 +32,9 @@ from quadvel_training.walking_rewards import (  # noqa: E402
 from tests.helpers.robots import ALIENGO  # noqa: E402
 
 SMALL = PrivilegedConfig(n=6, threads=1, length=4)
-CALM = EnvConfig(robot=ALIENGO, n=4, threads=1, period=0.02, timestep=0.004, randomisation=Randomisation.none())
+CALM = EnvConfig(
+    robot=ALIENGO, n=4, threads=1, period=0.02, timestep=0.004, randomisation=Randomisation.none()
+)
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_description.quadruped import joint_index  # noqa: E402
 from quadvel_eval.gait_kind import GaitKind  # noqa: E402
-from quadvel_training import gait_log, privileged  # noqa: E402
+from quadvel_training import gait_log  # noqa: E402
 from quadvel_training.command_grid import CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.gait_clock import duty_factor  # noqa: E402
@@ -25,7 +25,9 @@ from quadvel_training.walking_rewards import (  # noqa: E402
 from tests.helpers.robots import ALIENGO  # noqa: E402
 
 N = 3
-CALM = EnvConfig(robot=ALIENGO, n=N, threads=1, period=0.02, timestep=0.004, randomisation=Randomisation.none())
+CALM = EnvConfig(
+    robot=ALIENGO, n=N, threads=1, period=0.02, timestep=0.004, randomisation=Randomisation.none()
+)
 
 
 @pytest.fixture

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from mujoco.batch import Batch
 
+from quadvel_description.arrays import Array
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
-from quadvel_description.arrays import Array
 from quadvel_eval.bench import Benchmark
 from quadvel_policy.observation import DEFAULT_OBSERVATION
 
@@ -59,7 +59,9 @@ def _bare_tick(env: VelocityEnv) -> Callable[[], None]:
     It uses the same states because robots on their feet are faster to simulate than robots that
     stumble.
     """
-    batch = Batch(training_model(env.robot, env.config.timestep, env.config.terrain), env.config.n, env.config.threads)
+    batch = Batch(
+        training_model(env.robot, env.config.timestep, env.config.terrain), env.config.n, env.config.threads
+    )
     rows = [(batch.bind(name), env.batch.bind(name)) for name in ("qpos", "qvel", "ctrl")]
 
     def tick() -> None:

@@ -17,9 +17,9 @@ import attrs
 import numpy as np
 import torch
 
+from quadvel_description import symmetry
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
-from quadvel_description import symmetry
 from quadvel_policy.observation import DEFAULT_OBSERVATION
 from quadvel_sim.terrain import Terrain
 

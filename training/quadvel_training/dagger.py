@@ -408,6 +408,7 @@ def export_policy(
         about: how the policy was trained, for the metadata.
     """
     metadata = PolicyMetadata(
+        robot=env.robot.name,
         action_offset=tuple(env.stand_q),
         action_scale=(ACTION_SCALE,) * 12,
         action_clip=(-ACTION_BOUND, ACTION_BOUND),

@@ -186,7 +186,9 @@ class EnvConfig:
     terrain: Terrain = Terrain()
 
 
-def training_model(robot: Robot, timestep: float, terrain: Terrain, torsional_friction: float = 0.0) -> mujoco.MjModel:
+def training_model(
+    robot: Robot, timestep: float, terrain: Terrain, torsional_friction: float = 0.0
+) -> mujoco.MjModel:
     """Build the MuJoCo model of training: feet and trunk collide, there are no sensors.
 
     Args:

@@ -17,9 +17,9 @@ import attrs
 import numpy as np
 import torch
 
+from quadvel_description.quadruped import GRAVITY
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
-from quadvel_description.quadruped import GRAVITY
 from quadvel_estimator import features
 from quadvel_sim.terrain import Terrain
 

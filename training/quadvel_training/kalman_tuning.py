@@ -79,7 +79,13 @@ def record(config: TuningConfig, actor: Recurrent) -> WalkRecording:
     grounds = [
         [_window(walks, ticks) for _ in range(config.windows)]
         for walks in walks_on_both_grounds(
-            load_robot(config.robot), config.n, config.seed, config.commands, config.randomisation, config.rough, actor
+            load_robot(config.robot),
+            config.n,
+            config.seed,
+            config.commands,
+            config.randomisation,
+            config.rough,
+            actor,
         )
     ]
     parts = [window for ground in grounds for window in ground]

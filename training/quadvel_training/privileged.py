@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from quadvel_description import symmetry
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
-from quadvel_description import robot, symmetry
 from quadvel_description.symmetry import Mirror
 from quadvel_sim.terrain import Terrain
 

@@ -57,7 +57,9 @@ def rated_drives(robot: Robot) -> ActuatorParameters:
         middle = {"stall": float(np.mean(stall)), "no_load": float(np.mean(no_load))}
         ranges = {"stall": stall, "no_load": no_load}
         effects.append(Effect("torque_speed_limit", joints, middle, intervals=ranges))
-    return attrs.evolve(ActuatorParameters.of(robot), name=f"{robot.name}, rated drives", effects=tuple(effects))
+    return attrs.evolve(
+        ActuatorParameters.of(robot), name=f"{robot.name}, rated drives", effects=tuple(effects)
+    )
 
 
 ACTUATORS = {
@@ -251,8 +253,8 @@ def load_actuator(robot: Robot, name: str) -> ActuatorParameters:
 
     Args:
         robot: The robot.
-        name: `eam` (the robot's file; Table 4 for the AlienGo), `limited` or `rated` (with speed-torque curves), `ideal` (PD law), or
-            an actuator file.
+        name: `eam` (the robot's file), `limited` or `rated` (with speed-torque curves), `ideal` (PD law),
+            or an actuator file.
 
     Returns:
         Their parameters.

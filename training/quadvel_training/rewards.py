@@ -8,7 +8,6 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-
 from .env import HEAT_LOSS_W_PER_N2M2, TICK_S, VelocityEnv
 from .walking_rewards import hip_deviation
 

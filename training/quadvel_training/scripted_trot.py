@@ -61,6 +61,4 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
     # a planned stance carries 4 / (number of planned stances) of its load on four feet
     carried = down * 4.0 / np.maximum(down.sum(axis=1, keepdims=True), 1) - 1.0
     load = np.repeat(carried, 3, axis=1) * (env.stand_q - robot.nominal_q)
-    return np.asarray(
-        (inverse_kinematics(robot, feet) - robot.nominal_q + load) * (standing < 0.5)[:, None]
-    )
+    return np.asarray((inverse_kinematics(robot, feet) - robot.nominal_q + load) * (standing < 0.5)[:, None])

@@ -11,7 +11,6 @@ from typing import Protocol
 import attrs
 import numpy as np
 
-
 from .env import VelocityEnv
 from .gait_clock import GaitClock, foot_pace
 

@@ -302,7 +302,13 @@ class Walks:
 
 
 def walks_on_both_grounds(
-    robot: Robot, n: int, seed: int, commands: CommandRange, randomisation: Randomisation, rough: Terrain, actor: Recurrent
+    robot: Robot,
+    n: int,
+    seed: int,
+    commands: CommandRange,
+    randomisation: Randomisation,
+    rough: Terrain,
+    actor: Recurrent,
 ) -> tuple[Walks, Walks]:
     """Create walks on flat and on rough ground.
 
@@ -318,7 +324,9 @@ def walks_on_both_grounds(
     Returns:
         Walks on flat and on rough ground.
     """
-    config = EnvConfig(robot=robot, n=n // 2, seed=seed, commands=commands, randomisation=randomisation, episode=EPISODE)
+    config = EnvConfig(
+        robot=robot, n=n // 2, seed=seed, commands=commands, randomisation=randomisation, episode=EPISODE
+    )
     flat, uneven = (VelocityEnv(attrs.evolve(config, terrain=terrain)) for terrain in (Terrain(), rough))
     return Walks(flat, actor), Walks(uneven, actor)
 

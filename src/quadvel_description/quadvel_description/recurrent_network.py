@@ -23,6 +23,7 @@ from . import ahead
 from .network_file import NetworkFileError, read_network
 from .onnx_format import Message, serialise
 from .quadruped import JOINT_NAMES
+from .robot_name import UNNAMED_ROBOT
 
 METADATA_KEY = "quadvel"
 SCHEMA = 1
@@ -67,26 +68,31 @@ class RecurrentNetwork:
 
     Attributes:
         path: Path of the file.
-        metadata: Metadata of the file.
+        metadata: Metadata of the file, with the name of its robot.
     """
 
-    def __init__(self, path: str | Path, outputs: Mapping[str, int], fields: Sequence[str] = ()) -> None:
+    def __init__(
+        self, path: str | Path, robot: str, outputs: Mapping[str, int], fields: Sequence[str] = ()
+    ) -> None:
         """Load and check a network file.
 
         Args:
             path: Path of the file.
+            robot: Name of the robot that the network has to belong to.
             outputs: Length m of each further output (1, m), by name, in order.
             fields: Required metadata fields in addition to `schema`, `joint_names` and
-                `state_shape` (the shape of both memories).
+                `state_shape` (the shape of both memories). The field `robot` may be missing: the
+                network then belongs to UNNAMED_ROBOT.
 
         Raises:
-            NetworkFileError: The file is unreadable or does not match.
+            NetworkFileError: The file is unreadable, does not match or belongs to another robot.
         """
         self.path = Path(path)
         self._model = read_network(self.path)
         self._session = self._open_session(self._model)
         self.metadata = self._read_metadata(("schema", "joint_names", "state_shape", *fields))
         self._require("metadata field schema", self.metadata["schema"], SCHEMA)
+        self._require("metadata field robot", self.metadata["robot"], robot)
         self._require("metadata field joint_names", self.metadata["joint_names"], list(JOINT_NAMES))
         self._outputs = dict(outputs)
         self._check_signature()
@@ -242,7 +248,7 @@ class RecurrentNetwork:
         missing = [field for field in fields if field not in metadata]
         if missing:
             raise NetworkFileError(f"{self.path}: metadata {METADATA_KEY!r} lacks {', '.join(missing)}")
-        return metadata
+        return {"robot": UNNAMED_ROBOT, **metadata}
 
     def _check_signature(self) -> None:
         """Check names, types and shapes of inputs and outputs."""

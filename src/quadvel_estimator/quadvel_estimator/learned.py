@@ -12,6 +12,7 @@ from quadvel_description.network_file import NetworkFileError
 from quadvel_description.network_input import InputLayout
 from quadvel_description.recurrent_network import RecurrentNetwork
 from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.robot_name import UNNAMED_ROBOT
 from quadvel_description.state import RobotState
 
 from . import features
@@ -33,7 +34,7 @@ class LearnedEstimator:
             NetworkFileError: The file is missing or is not a velocity estimator for this robot and
                 rate.
         """
-        self._network = RecurrentNetwork(path, features.OUTPUTS, features.METADATA_FIELDS)
+        self._network = RecurrentNetwork(path, UNNAMED_ROBOT, features.OUTPUTS, features.METADATA_FIELDS)
         metadata = self._network.metadata
         self._expect("metadata field kind", metadata["kind"], features.KIND)
         self._expect("metadata field rate_hz", metadata["rate_hz"], features.RATE_HZ)

@@ -22,6 +22,7 @@ from quadvel_description.network_input import InputTerm as ObservationTerm
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.recurrent_network import SCHEMA
 from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.robot_name import UNNAMED_ROBOT
 
 RATE_HZ = 200.0
 JOINTS = len(JOINT_NAMES)
@@ -222,6 +223,7 @@ MAX_GAINS = {"kp": 500.0, "kd": 20.0}  # N m/rad, N m s/rad; larger than usual g
 
 _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "schema": _schema,
+    "robot": _text,
     "joint_names": _joint_names,
     "nominal_q": _per_joint,
     "action_offset": _per_joint,
@@ -246,6 +248,7 @@ class PolicyMetadata:
 
     Attributes:
         schema: Version of the format.
+        robot: Name of the robot; UNNAMED_ROBOT if a file has none.
         joint_names: Names of the joints, in order.
         nominal_q: Nominal posture, (12,), rad.
         action_offset: Joint targets of a zero action, (12,), rad: the nominal posture plus the
@@ -269,6 +272,7 @@ class PolicyMetadata:
     """
 
     schema: int = SCHEMA
+    robot: str
     joint_names: tuple[str, ...] = JOINT_NAMES
     nominal_q: Vector = tuple(NOMINAL_Q)
     action_offset: Vector
@@ -351,11 +355,11 @@ class PolicyMetadata:
                 raise MetadataError(
                     f"metadata field {field} is unknown, expected {', '.join(METADATA_FIELDS)}"
                 )
-        return cls(**data)
+        return cls(**{"robot": UNNAMED_ROBOT, **data})
 
 
 METADATA_FIELDS = tuple(field.name for field in attrs.fields(PolicyMetadata))
-REQUIRED_FIELDS = tuple(field for field in METADATA_FIELDS if field != "curve_limit")
+REQUIRED_FIELDS = tuple(field for field in METADATA_FIELDS if field not in ("robot", "curve_limit"))
 
 
 @attrs.frozen

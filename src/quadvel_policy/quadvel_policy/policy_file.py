@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from quadvel_description.network_file import NetworkFileError
 from quadvel_description.recurrent_network import RecurrentNetwork
+from quadvel_description.robot_name import UNNAMED_ROBOT
 
 from .observation import JOINTS, RATE_HZ, REQUIRED_FIELDS, MetadataError, PolicyMetadata
 
@@ -35,7 +36,7 @@ class PolicyFile:
             NetworkFileError: The file is missing or is not a policy for this robot and rate; one
                 sentence with the name of the file.
         """
-        network = RecurrentNetwork(path, {"actions": JOINTS}, REQUIRED_FIELDS)
+        network = RecurrentNetwork(path, UNNAMED_ROBOT, {"actions": JOINTS}, REQUIRED_FIELDS)
         try:
             self.metadata = PolicyMetadata.from_fields(network.metadata)
         except MetadataError as error:

@@ -9,6 +9,7 @@ from typing_extensions import override
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.fields import field
 from quadvel_description.robot import Robot, load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_driver.calibration import Calibration
 from quadvel_driver.unitree_dds.bus import MAX_DOMAIN
 from quadvel_nodes.scheduling import Scheduling
@@ -32,7 +33,7 @@ class PlantParameters(Scheduling):
         ValueError: `state_rate` is no divisor of 1000 Hz or below 50 Hz.
     """
 
-    robot: str = field("aliengo", "a shipped robot, or the path of a robot.yaml")
+    robot: str = field(DEFAULT_ROBOT, "a shipped robot, or the path of a robot.yaml")
     keyframe: str = field("lie", "posture at the start: lie or stand")
     state_rate: int = field(200, "rate of the states, Hz: a divisor of 1000, 50 at least")
     publish_tf: bool = field(False, "whether to publish the true transform from odom to base_link")
