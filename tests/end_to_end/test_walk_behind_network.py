@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.robot import ALIENGO, NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver import wire
-from quadvel_driver.aliengo import ALIENGO
 from quadvel_driver.board_state import BoardState
 from quadvel_driver.link import Link, LinkConfig, Transport
 from quadvel_driver.unitree_dds import wire as dds_wire
@@ -114,7 +113,7 @@ class BehindNetwork:
 
 def walked(simulator: Any, velocity: tuple[float, float, float]) -> np.ndarray:
     """Mean vx, vy (m/s), wz (rad/s) of a walk under a command."""
-    loop = RobotLoop(simulator, Supervisor(PolicyFile()), LearnedEstimator())
+    loop = RobotLoop(simulator, Supervisor(ALIENGO, PolicyFile(ALIENGO)), LearnedEstimator(ALIENGO))
     loop.start_walking()
     truths = []
     for tick in range(SETTLE + MEASURE):

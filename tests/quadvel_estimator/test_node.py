@@ -103,7 +103,10 @@ def test_each_state_is_answered_with_the_network_s_velocity(
     assert answer.header.stamp == state.stamp
     assert answer.header.frame_id == "base_link"
     velocity = answer.twist.twist.linear
-    expected = 0.5 * (features.build(standing(0.0), np.full(12, 0.2)) @ weights + 4)
+    expected = 0.5 * (
+        features.build(ALIENGO, standing(0.0), np.full(12, 0.2), features.default_layout(ALIENGO)) @ weights
+        + 4
+    )
     np.testing.assert_allclose([velocity.x, velocity.y, velocity.z], expected, atol=1e-4)
     np.testing.assert_allclose(
         np.reshape(answer.twist.covariance, (6, 6)).diagonal()[:3], [0.01, 0.0025, 0.0225], rtol=1e-5

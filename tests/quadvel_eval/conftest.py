@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from quadvel_description import mjcf, robot
+from quadvel_description.robot import ALIENGO
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_eval.robot_loop import RobotLoop, TrueVelocity
-from quadvel_policy.observation import PolicyMetadata
+from quadvel_policy.observation import PolicyMetadata, default_observation
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 
@@ -20,7 +21,9 @@ class StandingPolicy:
 
     def __init__(self) -> None:
         self.metadata = PolicyMetadata(
-            robot="aliengo",
+            robot=ALIENGO.name,
+            nominal_q=tuple(ALIENGO.nominal_q),
+            observation=default_observation(ALIENGO),
             action_offset=tuple(robot.NOMINAL_Q + mjcf.gravity_torque(mjcf.load_model()) / robot.KP),
             action_scale=1.0,
             kp=robot.KP,
@@ -51,8 +54,8 @@ def make_loop() -> Callable[..., RobotLoop]:
     def make(seed: int = 0) -> RobotLoop:
         simulator = Simulator(SimulatorConfig(seed=seed))
         simulator.reset("stand")
-        beside = {"kalman": KalmanEstimator()}
-        loop = RobotLoop(simulator, Supervisor(StandingPolicy()), TrueVelocity(simulator), beside)
+        beside = {"kalman": KalmanEstimator(ALIENGO)}
+        loop = RobotLoop(simulator, Supervisor(ALIENGO, StandingPolicy()), TrueVelocity(simulator), beside)
         loop.start_walking()
         return loop
 

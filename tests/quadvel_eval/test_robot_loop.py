@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from quadvel_description.robot import ALIENGO
 from quadvel_description.state import JointCommand
 from quadvel_eval.robot_loop import RobotLoop, Sample, TrueVelocity, make_estimator
 from quadvel_policy.supervisor import Supervisor
@@ -81,7 +82,7 @@ def test_the_supervisor_walks_on_the_estimate_of_the_state_before(standing_polic
 
 def test_a_refused_mode_raises_with_the_reason(standing_policy: Any) -> None:
     simulator = Simulator(SimulatorConfig())  # lies
-    loop = RobotLoop(simulator, Supervisor(standing_policy), TrueVelocity(simulator))
+    loop = RobotLoop(simulator, Supervisor(ALIENGO, standing_policy), TrueVelocity(simulator))
     with pytest.raises(RuntimeError, match=r"refused stance: .* off the nominal posture"):
         loop.start_walking()
 

@@ -17,8 +17,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 import quadvel_dds
-from quadvel_description.robot import KD, KP, NOMINAL_Q
-from quadvel_policy.observation import PolicyMetadata
+from quadvel_description.robot import ALIENGO, KD, KP, NOMINAL_Q
+from quadvel_policy.observation import PolicyMetadata, default_observation
 
 sys.path.insert(0, str(Path(__file__).parent))  # for `rig`
 quadvel_dds.install()  # before a test module imports rclpy
@@ -34,6 +34,8 @@ HIDDEN = 8
 def make_metadata(**changes: Any) -> PolicyMetadata:
     fields: dict[str, Any] = {
         "robot": "aliengo",
+        "nominal_q": tuple(ALIENGO.nominal_q),
+        "observation": default_observation(ALIENGO),
         "action_offset": tuple(NOMINAL_Q + 0.1),
         "action_scale": 0.25,
         "kp": KP,

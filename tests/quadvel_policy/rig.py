@@ -8,7 +8,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from quadvel_description.robot import LIE_Q
+from quadvel_description.robot import ALIENGO, LIE_Q
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_nodes.parameters import make_record
 from quadvel_policy.config import SupervisorConfig
@@ -29,7 +29,7 @@ class Rig:
         self, policy: Any, guards: Iterable[type[Guard]] = GUARDS, backup: Any = None, **config: Any
     ) -> None:
         self.policy = policy
-        self.supervisor = Supervisor(policy, make_record(SupervisorConfig, config), backup, guards)
+        self.supervisor = Supervisor(ALIENGO, policy, make_record(SupervisorConfig, config), backup, guards)
         zeros = np.zeros(12)
         upright, down = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 9.81])
         self.state = RobotState(

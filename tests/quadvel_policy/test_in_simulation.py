@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from quadvel_description import mjcf
-from quadvel_description.robot import KP, LIE_Q, NOMINAL_HEIGHT, NOMINAL_Q
+from quadvel_description.robot import ALIENGO, KP, LIE_Q, NOMINAL_HEIGHT, NOMINAL_Q
 from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import TickInput
@@ -37,7 +37,9 @@ class Stand:
             attrs.evolve(self.simulator.truth(), quaternion=quaternion), LIE_Q, np.zeros(12)
         )
         self.supervisor = Supervisor(
-            make_policy(action_offset=tuple(NOMINAL_Q + sag)), SupervisorConfig(auto_stand=auto_stand)
+            ALIENGO,
+            make_policy(action_offset=tuple(NOMINAL_Q + sag)),
+            SupervisorConfig(auto_stand=auto_stand),
         )
         self.torques: list[np.ndarray] = []
 

@@ -55,14 +55,14 @@ def test_a_posture_starts_with_the_torque_of_the_mode_before() -> None:
     rng = np.random.default_rng(2)
     before = some_command(rng)
     q = rng.normal(size=12)
-    posture = Posture([(1.0, NOMINAL_Q)], kp=100.0, kd=3.0)
+    posture = Posture(ALIENGO, [(1.0, NOMINAL_Q)], kp=100.0, kd=3.0)
     posture.enter(tick_at(0.0, q, before))
     first = posture.tick(tick_at(0.0, q, before))
     np.testing.assert_allclose(first.kp * (first.q - q), before.kp * (before.q - q) + before.tau, atol=1e-9)
 
 
 def test_a_posture_passes_its_waypoints_at_rest_and_holds_the_last() -> None:
-    posture = Posture([(0.8, LIE_Q), (1.2, NOMINAL_Q)], kp=100.0, kd=3.0)
+    posture = Posture(ALIENGO, [(0.8, LIE_Q), (1.2, NOMINAL_Q)], kp=100.0, kd=3.0)
     start = np.zeros(12)
     posture.enter(tick_at(0.0, start, JointCommand.damping()))
     for elapsed, expected in ((0.0, start), (0.8, LIE_Q), (2.0, NOMINAL_Q), (9.0, NOMINAL_Q)):
@@ -78,7 +78,7 @@ def test_on_a_slope_a_posture_keeps_the_feet_below_the_trunk(axis: tuple[float, 
     tilt = 0.25
     state = tick_at(0.0, NOMINAL_Q, JointCommand.damping()).state
     state.quaternion = np.array([np.cos(tilt / 2), *(np.sin(tilt / 2) * np.array(axis)), 0.0])
-    posture = Posture([(1.0, NOMINAL_Q)], kp=100.0, kd=3.0)
+    posture = Posture(ALIENGO, [(1.0, NOMINAL_Q)], kp=100.0, kd=3.0)
     feet = foot_positions(ALIENGO, posture.final_posture(state))
     np.testing.assert_allclose(feet[:, 2], -0.4, atol=1e-4)  # no leg shorter than before
     middle = rotate(state.quaternion, feet.mean(axis=0))
@@ -92,7 +92,7 @@ def test_a_posture_leans_by_at_most_20_degrees() -> None:
 
 
 def test_the_speed_of_a_posture_is_the_derivative_of_its_path() -> None:
-    posture = Posture([(0.8, LIE_Q), (1.2, NOMINAL_Q)], kp=100.0, kd=3.0)
+    posture = Posture(ALIENGO, [(0.8, LIE_Q), (1.2, NOMINAL_Q)], kp=100.0, kd=3.0)
     posture.enter(tick_at(0.0, np.zeros(12), JointCommand.damping()))
 
     def at(elapsed: float) -> JointCommand:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.robot import ALIENGO, NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_policy.operator_log import OperatorLog
 from quadvel_policy.supervisor import Supervisor
@@ -19,7 +19,7 @@ class Run:
     """A standing robot and the log of its supervisor."""
 
     def __init__(self, policy: Any) -> None:
-        self.supervisor = Supervisor(policy)
+        self.supervisor = Supervisor(ALIENGO, policy)
         self.log = OperatorLog(self.supervisor)
         self._ticks = 0
 

@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 from rig import FORWARD, STILL, Rig, assert_damping
 
-from quadvel_description.robot import COMMAND_UPPER, LIE_Q, NOMINAL_Q, TORQUE_LIMIT, UPPER
+from quadvel_description.robot import ALIENGO, COMMAND_UPPER, LIE_Q, NOMINAL_Q, TORQUE_LIMIT, UPPER
 from quadvel_description.state import MODE_SERVO
 from quadvel_nodes.parameters import make_record, parameter_fields
+from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.control_loop import ControlConfig
 from quadvel_policy.guards import GUARDS
 from quadvel_policy.guards.legs import EncoderInconsistent
 from quadvel_policy.observation import PolicyMetadata
+from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.transitions import MODES
 
 WITHOUT_ENCODERS = [guard for guard in GUARDS if guard is not EncoderInconsistent]
@@ -431,11 +433,20 @@ def test_a_limit_that_protects_nothing_is_refused_with_the_value_and_the_bound(
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("max_tilt", 1.6), ("max_torque_error", 45.0), ("stuck_torque", 1.01), ("max_power", 1e4)],
+    [("max_tilt", 1.6), ("max_torque_error", 1e4), ("stuck_torque", 1.01), ("max_power", 1e6)],
 )
 def test_a_limit_that_no_robot_reaches_is_refused(field: str, value: float) -> None:
     with pytest.raises(ValueError, match=field):
         make_record(ControlConfig, {field: value})
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("max_torque_step", 89.0), ("max_torque_error", 45.0), ("max_power", 1e4)]
+)
+def test_a_limit_beyond_the_drives_of_the_robot_is_refused(policy: Any, field: str, value: float) -> None:
+    expected = rf"^\w+\.{field}: found {value}, expected at most [0-9.]+, what the drives of AlienGo can do$"
+    with pytest.raises(ValueError, match=expected):
+        Supervisor(ALIENGO, policy, make_record(SupervisorConfig, {field: value}))
 
 
 def test_limits_of_the_command_come_from_the_policy(metadata: PolicyMetadata, rig: Rig) -> None:

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from quadvel_description.kinematics import roll_pitch
-from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.robot import ALIENGO, NOMINAL_Q
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
-from quadvel_driver.aliengo import ALIENGO
 from quadvel_driver.board_state import BoardState
 from quadvel_driver.calibration import Calibration
 from quadvel_driver.link import NO_CALIBRATION, Link

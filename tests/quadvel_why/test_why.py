@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from quadvel_bringup import cli
+from quadvel_description.robot import ALIENGO
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import Diagnosis, diagnose
 from quadvel_why.links import CAUSES
@@ -28,7 +29,7 @@ def run(walk: Path) -> Run:
 
 
 def examine(run: Run) -> Diagnosis:
-    return diagnose(Signals(run, PolicyFile()))
+    return diagnose(Signals(run, PolicyFile(ALIENGO)))
 
 
 def commands(run: Run, **fields: object) -> Run:
@@ -41,7 +42,7 @@ def imu(run: Run, **fields: object) -> Run:
 
 
 def scaled_targets(c: Commands) -> np.ndarray:
-    offset = np.array(PolicyFile().metadata.action_offset)
+    offset = np.array(PolicyFile(ALIENGO).metadata.action_offset)
     walks = np.isclose(c.kp, 30.0)
     return np.where(walks, offset + 0.6 * (c.q - offset), c.q)
 

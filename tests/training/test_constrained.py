@@ -8,6 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
+from quadvel_description.robot import ALIENGO  # noqa: E402
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import constrained, loop  # noqa: E402
 from quadvel_training.constrained import ConstrainedConfig, ConstrainedRun  # noqa: E402
@@ -109,7 +110,7 @@ def test_a_start_of_its_own_brings_its_critic_and_needs_no_teacher(files, tmp_pa
 def test_the_policy_file_answers_as_the_network_does(files, tmp_path):
     run = ConstrainedRun(SMALL, *files)
     run.write_policy(tmp_path / "policy.onnx", {})
-    policy = PolicyFile(tmp_path / "policy.onnx")
+    policy = PolicyFile(ALIENGO, tmp_path / "policy.onnx")
     obs = np.random.default_rng(0).normal(size=(5, 48)).astype(np.float32)
     with torch.no_grad():
         expected, _ = run.policy()(torch.from_numpy(obs[:, None]), run.policy().initial_state(1))

@@ -11,6 +11,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 from quadvel_description import robot  # noqa: E402
 from quadvel_description.kinematics import rotation_matrix  # noqa: E402
 from quadvel_description.quadruped import GRAVITY  # noqa: E402
+from quadvel_description.robot import ALIENGO  # noqa: E402
 from quadvel_description.state import JointCommand, RobotState  # noqa: E402
 from quadvel_estimator import features  # noqa: E402
 from quadvel_estimator.kalman import KalmanConfig  # noqa: E402
@@ -50,7 +51,7 @@ def test_postures_are_those_of_the_controller(monkeypatch):
         modes.set_targets(np.zeros((1, 12)), robot.KP, robot.KD)
         modes.advance(q[None])
     c = SupervisorConfig()
-    fold = Posture([(c.fold_time, robot.LIE_Q)], c.stand_kp, c.stand_kd)
+    fold = Posture(ALIENGO, [(c.fold_time, robot.LIE_Q)], c.stand_kp, c.stand_kd)
     state = RobotState(
         0.0, 0, q, np.zeros(12), np.zeros(12), np.array([1.0, 0, 0, 0]), *np.zeros((2, 3)), np.zeros(4)
     )
@@ -129,7 +130,7 @@ def believing(which: int) -> VelocityNetwork:
 
 def seen(sensed: RobotState, ticks: int) -> torch.Tensor:
     """The network's input (T, 1, 69) of a constant state."""
-    x = features.build(sensed, np.zeros(12))
+    x = features.build(ALIENGO, sensed, np.zeros(12), features.default_layout(ALIENGO))
     return torch.from_numpy(np.tile(x, (ticks, 1, 1)))
 
 
@@ -153,7 +154,9 @@ def test_the_network_can_believe_one_leg():
     with torch.no_grad():
         output, _ = network(seen(state, 2), network.initial_state(1))
     np.testing.assert_allclose(
-        output[1, 0, :3].numpy(), leg_velocity(state, rotation_matrix(state.quaternion))[2], atol=1e-5
+        output[1, 0, :3].numpy(),
+        leg_velocity(ALIENGO, state, rotation_matrix(state.quaternion))[2],
+        atol=1e-5,
     )
 
 
@@ -175,13 +178,18 @@ def test_a_trained_network_runs_as_a_file(tmp_path, actor):
     run = EstimatorRun(EstimatorConfig(n=8, length=4, mini_batches=2), actor)
     run.step(0.9)
     run.export(tmp_path / "estimator.onnx", {"stage": "test"})
-    estimator = LearnedEstimator(tmp_path / "estimator.onnx")
+    estimator = LearnedEstimator(ALIENGO, tmp_path / "estimator.onnx")
     sensed = run.walks[0].walks.sense()
     action = run.walks[0].walks.previous_action
     state = run.network.initial_state(4)
     for _ in range(3):
         with torch.no_grad():
-            output, state = run.network(torch.from_numpy(features.build(sensed, action)[None]), state)
+            output, state = run.network(
+                torch.from_numpy(
+                    features.build(ALIENGO, sensed, action, features.default_layout(ALIENGO))[None]
+                ),
+                state,
+            )
         arrays = {k: v[0] for k, v in attrs.asdict(sensed).items() if isinstance(v, np.ndarray)}
         velocity, covariance = estimator.update(attrs.evolve(sensed, **arrays), action[0])
         np.testing.assert_allclose(velocity, output[0, 0, :3].numpy(), atol=1e-5)

@@ -12,6 +12,7 @@ from typing import Annotated
 
 import typer
 
+from quadvel_description.robot import ALIENGO
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import LIMITS_FILE
 from quadvel_why.links import CAUSES
@@ -29,7 +30,7 @@ def main(
     out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("out/why_limits"),
 ) -> None:
     """Measure healthy walks."""
-    policy = PolicyFile()
+    policy = PolicyFile(ALIENGO)
     largest: dict[str, float] = {}
     for seed in range(FIRST_SEED, FIRST_SEED + walks):
         path = out / f"{seed}.mcap"

@@ -18,6 +18,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from quadvel_description.robot import ALIENGO
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import diagnose
 from quadvel_why.reading import read_run
@@ -105,7 +106,7 @@ def main(
     rounds: Annotated[int, typer.Option(help="Strengths, from weak to strong.")] = STRENGTHS,
 ) -> None:
     """Measure the diagnosis."""
-    policy, wanted = PolicyFile(), set(filter(None, kinds.split(",")))
+    policy, wanted = PolicyFile(ALIENGO), set(filter(None, kinds.split(",")))
     folder = out / f"suite_{suite}"
     folder.mkdir(parents=True, exist_ok=True)
     results = []

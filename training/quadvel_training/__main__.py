@@ -15,6 +15,7 @@ import typer
 from rich.progress import Progress, TextColumn
 
 from quadvel_actuator.parameters import ActuatorParameters
+from quadvel_description.robot import ALIENGO
 from quadvel_estimator.kalman import KalmanConfig
 from quadvel_eval.paper import gap
 from quadvel_policy.observation import VelocityCommandLimits
@@ -304,7 +305,7 @@ def limit(
 
     `quadvel paper --only sustained` shows the share of the drives' speed that each command needs.
     """
-    known = PolicyFile(policy).metadata.limits
+    known = PolicyFile(ALIENGO, policy).metadata.limits
     low, high = list(known.low), list(known.high)
     for axis, back, ahead in ((0, backward, forward), (1, sideways, sideways), (2, turn, turn)):
         low[axis] = low[axis] if back is None else -back

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from quadvel_description.quadruped import GRAVITY
+from quadvel_description.robot import ALIENGO
 from quadvel_estimator import features
 from quadvel_sim.terrain import Terrain
 
@@ -32,6 +33,7 @@ from .walks import Walks, walks_on_both_grounds
 
 MEMORY = 128
 HIDDEN = (64,)
+LAYOUT = features.default_layout(ALIENGO)
 INITIAL_INERTIA_LOGIT = 2.0  # before training; the legs correct the velocity within some ticks
 
 
@@ -46,7 +48,7 @@ class VelocityNetwork(Recurrent):
 
     def __init__(self) -> None:
         """Create the network; at first it relies on inertia."""
-        super().__init__(features.DEFAULT_LAYOUT.size, 6 + 5, MEMORY, HIDDEN)
+        super().__init__(features.INPUT_SIZE, 6 + 5, MEMORY, HIDDEN)
         with torch.no_grad():
             self.body[-1].bias[-1] = INITIAL_INERTIA_LOGIT
         spin = torch.linalg.cross(*torch.broadcast_tensors(torch.eye(3)[:, None], torch.eye(3)))
@@ -102,7 +104,7 @@ class VelocityNetwork(Recurrent):
 def _quantity(x: torch.Tensor, name: str) -> torch.Tensor:
     """Extract a quantity from the network input (..., 69), in its unit, up to clipping."""
     start = 0
-    for term in features.DEFAULT_LAYOUT.terms:
+    for term in LAYOUT.terms:
         if term.name == name:
             return x[..., start : start + term.size] / term.scale
         start += term.size
@@ -149,7 +151,7 @@ class EstimatedWalks:
         with torch.no_grad():
             for _ in range(length):
                 sensed = walks.sense()
-                x = features.build(sensed, walks.previous_action)
+                x = features.build(ALIENGO, sensed, walks.previous_action, LAYOUT)
                 rows.append((x, walks.truth.copy(), ~walks.over))
                 # the controller has the estimate of the state before
                 believed = np.where(self.on_estimate[:, None], self._estimate, walks.noisy_truth())
@@ -301,8 +303,8 @@ class EstimatorRun:
             path: ONNX file.
             recipe: how it was trained, for the metadata.
         """
-        metadata = features.metadata((1, 1, MEMORY + 3), recipe, commit())
-        export(self.network, features.DEFAULT_LAYOUT.size, path, list(features.OUTPUTS), json.dumps(metadata))
+        metadata = features.metadata(ALIENGO, (1, 1, MEMORY + 3), recipe, commit(), LAYOUT)
+        export(self.network, features.INPUT_SIZE, path, list(features.OUTPUTS), json.dumps(metadata))
 
     def step(self, done: float) -> dict[str, float]:
         """Collect a sequence on each ground and learn from both.

@@ -8,6 +8,7 @@ import attrs
 import numpy as np
 from scipy.optimize import minimize
 
+from quadvel_description.robot import ALIENGO
 from quadvel_description.state import RobotState
 from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator
 from quadvel_sim.terrain import Terrain
@@ -117,7 +118,7 @@ def rmse(config: KalmanConfig, recording: WalkRecording) -> np.ndarray:
         (2, 3), m/s per axis, on flat and on rough ground.
     """
     robots = recording.truth.shape[1]
-    estimator = KalmanEstimator(config, (robots,))
+    estimator = KalmanEstimator(ALIENGO, config, (robots,))
     square, count = np.zeros((robots, 3)), np.zeros((robots, 1))
     for state, truth, judged in zip(recording.states, recording.truth, recording.is_scored, strict=True):
         velocity, _ = estimator.update(state)

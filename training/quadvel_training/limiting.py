@@ -9,6 +9,7 @@ import attrs
 from quadvel_description.network_file import read_network
 from quadvel_description.onnx_format import message, serialise
 from quadvel_description.recurrent_network import METADATA_KEY
+from quadvel_description.robot import ALIENGO
 from quadvel_policy.observation import COMMAND_AXES, VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_recordings.output import atomic_write
@@ -25,7 +26,7 @@ def limit_commands(policy: Path, limits: VelocityCommandLimits) -> None:
         ValueError: the limits are wider than those in the file, which the policy was trained for.
         NetworkFileError: the file is no policy file.
     """
-    metadata = PolicyFile(policy).metadata
+    metadata = PolicyFile(ALIENGO, policy).metadata
     bounds = dict(zip(COMMAND_AXES, zip(limits.low, limits.high, strict=True), strict=True))
     for axis, (low, high) in bounds.items():
         least, most = metadata.command_limits[axis]

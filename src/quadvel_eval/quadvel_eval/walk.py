@@ -19,6 +19,7 @@ from quadvel_description.arrays import Array, Bools
 from quadvel_description.fields import field
 from quadvel_description.kinematics import rotate, yaw
 from quadvel_description.quadruped import GRAVITY
+from quadvel_description.robot import ALIENGO
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
@@ -117,7 +118,7 @@ def make_loop(setup: Setup, seed: int, shadow_estimators: Sequence[str] = ("lear
     simulator = make_simulator(setup, seed)
     loop = RobotLoop(
         simulator,
-        Supervisor(PolicyFile(setup.policy), backup=KalmanEstimator()),
+        Supervisor(ALIENGO, PolicyFile(ALIENGO, setup.policy), backup=KalmanEstimator(ALIENGO)),
         make_estimator(setup.estimator, simulator, setup.estimator_file),
         shadow_estimators={
             name: make_estimator(name, simulator, setup.estimator_file) for name in shadow_estimators

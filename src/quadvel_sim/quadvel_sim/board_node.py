@@ -13,6 +13,7 @@ from typing import Any
 from sensor_msgs.msg import Joy
 from typing_extensions import override
 
+from quadvel_description.robot import load_robot
 from quadvel_description.state import RobotState
 from quadvel_driver.board_state import Button, Remote
 from quadvel_driver.unitree_dds.bus import Bus
@@ -81,7 +82,7 @@ def make_board(settings: BoardParameters) -> Board:
     Raises:
         ValueError: The address cannot be used.
     """
-    if settings.robot == "go2":
+    if load_robot(settings.robot).drive.board == "unitree_dds":
         return DdsBoard(Bus(settings.dds_domain, settings.interface), settings, settings.calibration())
     return UdpBoard((settings.address, settings.port), settings, settings.calibration())
 

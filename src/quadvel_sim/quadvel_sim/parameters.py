@@ -9,7 +9,6 @@ from typing_extensions import override
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.fields import field
 from quadvel_driver.calibration import Calibration
-from quadvel_driver.parameters import ROBOTS
 from quadvel_driver.unitree_dds.bus import MAX_DOMAIN
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_sim.bad_network import NetworkConfig
@@ -173,8 +172,7 @@ class BoardParameters(PlantParameters, NetworkConfig):
 
     robot: str = field(
         "aliengo",
-        f"whose packets: {' (UDP) or '.join(ROBOTS)} (DDS); the physics are the AlienGo's",
-        one_of=ROBOTS,
+        "whose packets, a name or the path of a robot.yaml; the physics are the AlienGo's",
     )
     state_rate: int = field(1000, "rate of the states, Hz: a divisor of 1000, 50 at least")
     address: str = field("127.0.0.1", "IP address on which the board listens")

@@ -10,7 +10,7 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Array
-from quadvel_description.robot import LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
+from quadvel_description.robot import ALIENGO, LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
@@ -113,7 +113,7 @@ def run_campaign(
 @cache
 def _networks() -> tuple[PolicyFile, LearnedEstimator]:
     """Load the shipped networks once per process."""
-    return PolicyFile(), LearnedEstimator()
+    return PolicyFile(ALIENGO), LearnedEstimator(ALIENGO)
 
 
 def run_case(case: Case, seed: int) -> FaultRun:

@@ -17,6 +17,7 @@ import numpy as np
 
 from quadvel_description.arrays import Array
 from quadvel_description.kinematics import rotate, yaw
+from quadvel_description.robot import ALIENGO
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL
 from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, Plan, State
@@ -111,7 +112,7 @@ class Tour:
         self.setup, self.world = setup, World.load(setup.world)
         self.simulator = Simulator(SimulatorConfig(world=self.world, seed=setup.seed, **setup.plant))
         self.simulator.reset("stand")
-        supervisor = Supervisor(PolicyFile(setup.policy), backup=KalmanEstimator())
+        supervisor = Supervisor(ALIENGO, PolicyFile(ALIENGO, setup.policy), backup=KalmanEstimator(ALIENGO))
         estimator = make_estimator(setup.estimator, self.simulator, setup.estimator_file)
         self._loop = RobotLoop(self.simulator, supervisor, estimator)
         laser = self.world.laser

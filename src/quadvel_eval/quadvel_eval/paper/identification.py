@@ -12,6 +12,7 @@ from typing_extensions import override
 
 from quadvel_description import robot
 from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import ALIENGO
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
@@ -127,7 +128,7 @@ def record_mixed_walk(setup: Setup, seed: int, bounds: VelocityCommandLimits) ->
     simulator = RecordingSimulator(SimulatorConfig(**{"seed": seed, **setup.plant}))
     simulator.reset("stand")
     estimator = make_estimator(setup.estimator, simulator, setup.estimator_file)
-    loop = RobotLoop(simulator, Supervisor(PolicyFile(setup.policy)), estimator)
+    loop = RobotLoop(simulator, Supervisor(ALIENGO, PolicyFile(ALIENGO, setup.policy)), estimator)
     loop.start_walking()
     start = simulator.time
     fast, aside, turn = bounds.high
