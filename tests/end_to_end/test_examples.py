@@ -127,7 +127,7 @@ LEFT_OUT = {
     "quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml": "test_calibration.py has one",
     "quadvel up --low-level board": "a board waits for nobody; tests/end_to_end/test_board.py, on a machine with time to spare",
     "quadvel record low_state --seconds 5 --out standing.mcap": "as the other recordings",
-    "quadvel up --low-level aliengo": "needs the robot",
+    "quadvel up --low-level driver": "needs the robot",
     "quadvel run driver": "the same",
     "quadvel run driver --ros-args -p calibration:=calibration.yaml": "the same",
     "quadvel run board --ros-args -p robot:=go2 -p state_rate:=500 -p hung:=true": "all of this machine share DDS domain 1; "

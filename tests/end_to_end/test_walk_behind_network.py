@@ -13,7 +13,6 @@ import pytest
 
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver import wire
-from quadvel_driver.aliengo import ALIENGO as DRIVEN
 from quadvel_driver.board_state import BoardState
 from quadvel_driver.link import Link, LinkConfig, Transport
 from quadvel_driver.unitree_dds import wire as dds_wire
@@ -62,7 +61,7 @@ class BehindNetwork:
         self._wire = Wire()
         self._newest: RobotState | None = None
         self.time = 50.0
-        self.link = Link(DRIVEN, packets, self._wire, LinkConfig(), self._on_state, clock=lambda: self.time)
+        self.link = Link(ALIENGO, packets, self._wire, LinkConfig(), self._on_state, clock=lambda: self.time)
         self._warming_up = True
         self.step(300)  # the link finds out in what unit the board counts
         self._warming_up = False
@@ -114,7 +113,7 @@ class BehindNetwork:
 
 def walked(simulator: Any, velocity: tuple[float, float, float]) -> np.ndarray:
     """Mean vx, vy (m/s), wz (rad/s) of a walk under a command."""
-    loop = RobotLoop(simulator, Supervisor(PolicyFile()), LearnedEstimator())
+    loop = RobotLoop(simulator, Supervisor(ALIENGO, PolicyFile(ALIENGO)), LearnedEstimator(ALIENGO))
     loop.start_walking()
     truths = []
     for tick in range(SETTLE + MEASURE):

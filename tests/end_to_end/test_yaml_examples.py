@@ -45,7 +45,7 @@ def _as_parameters(block: str, folder: Path) -> None:
     for name, values in (("alone", given), ("copy", whole)):
         file = folder / f"{name}.yaml"
         file.write_text(yaml.safe_dump(values))
-        for low_level in ("sim", "aliengo"):
+        for low_level in ("sim", "driver"):
             check_stack(Stack(low_level=low_level, parameters=file))
 
 

@@ -38,7 +38,7 @@ def test_nodes_that_are_not_installed_are_refused(monkeypatch: pytest.MonkeyPatc
         Stack().commands()
     with pytest.raises(ValueError, match=sentence):
         check_node("sim_node", [])
-    assert list(Stack(low_level="aliengo").commands()) == [*ROBOT]
+    assert list(Stack(low_level="driver").commands()) == [*ROBOT]
 
 
 @pytest.mark.usefixtures("missing")

@@ -10,6 +10,7 @@ import pytest
 from quadvel_bringup import up
 from quadvel_bringup.preflight import NODE_CHECKS, check_arguments, check_stack
 from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
+from quadvel_policy.policy_file import SHIPPED_POLICY
 
 
 @pytest.fixture(autouse=True)
@@ -46,6 +47,18 @@ def test_the_shipped_stack_is_in_order() -> None:
         ),
         ({"policy": Path("nowhere.onnx")}, r"controller: .*nowhere\.onnx: no such file"),
         ({"policy": PARAMETERS}, r"controller: .*params\.yaml"),
+        (
+            {"robot": "spot", "low_level": "external"},
+            "robot: found 'spot', expected aliengo, go2 or the path of a robot.yaml",
+        ),
+        (
+            {"robot": "go2", "low_level": "external", "estimator": "kalman"},
+            r"policies/go2/crl_eam\.onnx: no such file is shipped for the robot 'go2'",
+        ),
+        (
+            {"robot": "go2", "low_level": "driver", "estimator": "kalman", "policy": SHIPPED_POLICY},
+            r"controller: .*crl_eam\.onnx: metadata field robot is 'aliengo', expected 'go2'",
+        ),
         (
             {"actuator": Path("nowhere.yaml")},
             "sim_node: actuator_file: cannot read .*nowhere.yaml: No such file",
@@ -98,6 +111,16 @@ def test_a_wrong_parameter_file_is_refused_before_anything_starts(
     with pytest.raises(ValueError, match=sentence) as refusal:
         up.up(Stack(low_level=low_level, parameters=written(tmp_path / "p.yaml", text)))
     assert "\n" not in str(refusal.value)
+
+
+def test_a_controller_of_another_robot_than_the_drivers_is_refused_before_anything_starts(
+    tmp_path: Path,
+) -> None:
+    file = written(tmp_path / "p.yaml", "driver:\n  ros__parameters: {robot: go2}")
+    with pytest.raises(
+        ValueError, match="estimator: robot is 'aliengo', expected 'go2', the robot of driver"
+    ):
+        up.up(Stack(low_level="driver", parameters=file))
 
 
 def test_parameters_for_every_node_and_for_one_in_any_namespace_are_understood(tmp_path: Path) -> None:

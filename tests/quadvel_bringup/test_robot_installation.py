@@ -56,7 +56,7 @@ def robot_is_up(robot: Path, tmp_path: Path) -> Iterator[Path]:
     """The log of `quadvel up`, which runs in the fresh environment, with a board that runs in this one."""
     (tmp_path / "params.yaml").write_text(PARAMETERS)
     board = [sys.executable, "-m", "quadvel_bringup", "run", "board", "--ros-args", "-p", f"port:={PORT}"]
-    up = [robot / "quadvel", "up", "--low-level", "aliengo", "--params", tmp_path / "params.yaml"]
+    up = [robot / "quadvel", "up", "--low-level", "driver", "--params", tmp_path / "params.yaml"]
     log = tmp_path / "log"
     with log.open("w") as output:
         processes = [subprocess.Popen(words, stdout=output, stderr=output) for words in (board, up)]

@@ -144,12 +144,17 @@ def test_behind_the_boards_interface_stand_the_simulated_board_and_the_real_driv
     assert list(overrides) == ["board", "driver", "estimator", "controller", "command_mux"]
     port = 8007 + int(os.environ["ROS_DOMAIN_ID"])
     assert overrides["board"] == {"port": port, "terrain": "rough", "network_loss": 0.1}
-    assert overrides["driver"] == {"board_address": "127.0.0.1", "board_port": port, "local_port": 0}
+    assert overrides["driver"] == {
+        "board_address": "127.0.0.1",
+        "board_port": port,
+        "local_port": 0,
+        "dds_domain": 1,
+    }
     assert overrides["controller"] == {"auto_stand": True}
 
 
 def test_the_robot_itself_stands_up_and_walks_only_on_an_operators_call() -> None:
-    overrides = Stack(low_level="aliengo").node_parameters()
+    overrides = Stack(low_level="driver").node_parameters()
     assert list(overrides) == ["driver", "estimator", "controller", "command_mux"]
     assert overrides["driver"] == overrides["estimator"] == {"realtime_priority": 50}
     assert overrides["controller"] == {
@@ -157,6 +162,17 @@ def test_the_robot_itself_stands_up_and_walks_only_on_an_operators_call() -> Non
         "require_operator": True,
         "realtime_priority": 50,
     }
+
+
+def test_every_node_that_has_to_know_the_robot_is_told_its_name_or_file() -> None:
+    overrides = Stack(low_level="driver", robot="go2").node_parameters()
+    assert {name for name, values in overrides.items() if values.get("robot") == "go2"} == {
+        "driver",
+        "estimator",
+        "controller",
+    }
+    file = Stack(low_level="external", robot="mine/robot.yaml").node_parameters()["controller"]["robot"]
+    assert file == str(Path("mine/robot.yaml").resolve())
 
 
 def test_what_a_robot_cannot_do_is_refused_by_name() -> None:

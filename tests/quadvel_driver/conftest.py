@@ -11,13 +11,12 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver import wire
-from quadvel_driver.aliengo import ALIENGO
 from quadvel_driver.board_state import BoardState, Remote
 from quadvel_driver.link import Link
 from quadvel_driver.udp import UdpConfig, UdpTransport
+from tests.helpers.robots import ALIENGO
 
 NO_REMOTE = Remote()
 
@@ -27,7 +26,7 @@ def standing(tick: int, remote: Remote = NO_REMOTE) -> BoardState:
     robot = RobotState(
         time=0.0,
         tick=tick,
-        q=np.array(NOMINAL_Q),
+        q=np.array(ALIENGO.nominal_q),
         dq=np.zeros(12),
         tau=np.zeros(12),
         quaternion=np.array([1.0, 0.0, 0.0, 0.0]),

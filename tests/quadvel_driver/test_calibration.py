@@ -12,13 +12,14 @@ import pytest
 from quadvel_description import robot
 from quadvel_description.kinematics import roll_pitch, rotate_inverse
 from quadvel_description.mjcf import Plant, load_model
-from quadvel_description.robot import ALIENGO, NOMINAL_Q
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver.calibration import Calibration, CalibrationError
 from quadvel_driver.find_calibration import CalibrationDataError, Samples, fit_calibration, holding_torque
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.simulator import Simulator
 from quadvel_sysid.excitation import Creep
+from tests.helpers.robots import ALIENGO
 
 DEGREE = np.pi / 180.0
 OFF = Calibration(

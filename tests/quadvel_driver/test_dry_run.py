@@ -7,23 +7,22 @@ from typing import Any
 import numpy as np
 import pytest
 
+from quadvel_description.robot import Robot, load_robot
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
-from quadvel_driver.aliengo import ALIENGO
-from quadvel_driver.driven_robot import DrivenRobot
 from quadvel_driver.dry_run import DryRun
 from quadvel_driver.link import Link, LinkConfig
 from quadvel_driver.unitree_dds import wire as dds_wire
-from quadvel_driver.unitree_dds.go2 import GO2
+from tests.helpers.robots import ALIENGO
+
+GO2 = load_robot("go2")
 
 
 @pytest.mark.parametrize(
     ("robot", "packets", "begin"),
     [(ALIENGO, wire, "610 bytes, ff000000"), (GO2, dds_wire, "812 bytes, 00010000feefff00")],
 )
-def test_the_last_packet_is_described_leg_by_leg_and_clamped(
-    robot: DrivenRobot, packets: Any, begin: str
-) -> None:
+def test_the_last_packet_is_described_leg_by_leg_and_clamped(robot: Robot, packets: Any, begin: str) -> None:
     dry_run = DryRun(robot, packets)
     assert dry_run.summary() == "no packet yet"
     link = Link(robot, packets, dry_run, LinkConfig(), print)

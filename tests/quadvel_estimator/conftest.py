@@ -16,14 +16,14 @@ from onnx import TensorProto, helper, numpy_helper
 
 import quadvel_dds
 from quadvel_description.quadruped import GRAVITY
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_estimator import features
+from tests.helpers.robots import ALIENGO
 
 quadvel_dds.install()  # before a test module imports rclpy
 
 MEMORY = (1, 1, 3)
-WEIGHTS = np.random.default_rng(0).normal(size=(features.DEFAULT_LAYOUT.size, 3)).astype(np.float32)
+WEIGHTS = np.random.default_rng(0).normal(size=(features.INPUT_SIZE, 3)).astype(np.float32)
 VARIANCE = np.array([0.04, 0.01, 0.09])
 
 
@@ -35,7 +35,7 @@ def standing() -> Callable[..., RobotState]:
         still = RobotState(
             time=time,
             tick=round(1e3 * time),
-            q=NOMINAL_Q,
+            q=ALIENGO.nominal_q,
             dq=np.zeros(12),
             tau=np.zeros(12),
             quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
@@ -100,7 +100,14 @@ def write_estimator_file(
         [numpy_helper.from_array(value, name) for name, value in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    good = features.metadata(MEMORY, recipe="none", commit="test", output_scale=0.5)
+    good = features.metadata(
+        ALIENGO,
+        MEMORY,
+        recipe="none",
+        commit="test",
+        layout=features.default_layout(ALIENGO),
+        output_scale=0.5,
+    )
     helper.set_model_props(model, {"quadvel": json.dumps(good | changes) if metadata is None else metadata})
     onnx.save(model, path)
     return path

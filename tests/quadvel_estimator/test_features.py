@@ -7,9 +7,11 @@ import pytest
 
 from quadvel_description.network_input import InputLayout
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_estimator import features
+from tests.helpers.robots import ALIENGO
+
+LAYOUT = features.default_layout(ALIENGO)
 
 
 def some_state() -> RobotState:
@@ -17,7 +19,7 @@ def some_state() -> RobotState:
     return RobotState(
         time=1.0,
         tick=5,
-        q=NOMINAL_Q + 0.01 * np.arange(1, 13),
+        q=ALIENGO.nominal_q + 0.01 * np.arange(1, 13),
         dq=np.arange(1.0, 13.0),
         tau=np.arange(-6.0, 6.0),
         quaternion=np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]),
@@ -46,7 +48,7 @@ GOLDEN = np.array(
 
 
 def test_the_input_is_these_69_numbers() -> None:
-    vector = features.build(some_state(), np.arange(-6, 6) / 10)
+    vector = features.build(ALIENGO, some_state(), np.arange(-6, 6) / 10, LAYOUT)
     assert vector.dtype == np.float32
     np.testing.assert_allclose(vector, GOLDEN, atol=1e-5)
 
@@ -59,27 +61,31 @@ def test_a_batch_gives_the_same_as_one_by_one() -> None:
         setattr(batch, name, rng.normal(size=(2, 5, size)))
     batch.quaternion /= np.linalg.norm(batch.quaternion, axis=-1, keepdims=True)
     action = rng.normal(size=(2, 5, 12))
-    whole = features.build(batch, action)
+    whole = features.build(ALIENGO, batch, action, LAYOUT)
     assert whole.shape == (2, 5, 69)
     one = some_state()
     for name in sizes:
         setattr(one, name, getattr(batch, name)[1, 3])
-    np.testing.assert_array_equal(whole[1, 3], features.build(one, action[1, 3]))
+    np.testing.assert_array_equal(whole[1, 3], features.build(ALIENGO, one, action[1, 3], LAYOUT))
 
 
 def test_a_shock_is_clipped() -> None:
     state = some_state()
     state.linear_acceleration = np.array([1e4, 0.0, -1e4])
-    np.testing.assert_array_equal(features.build(state, np.zeros(12))[27:30], [5.0, 0.0, -5.0])
+    np.testing.assert_array_equal(
+        features.build(ALIENGO, state, np.zeros(12), LAYOUT)[27:30], [5.0, 0.0, -5.0]
+    )
 
 
 def test_the_metadata_carries_the_layout_through_json() -> None:
-    data = json.loads(json.dumps(features.metadata((1, 1, 64), recipe={"lr": 1e-3}, commit="abc")))
+    data = json.loads(
+        json.dumps(features.metadata(ALIENGO, (1, 1, 64), recipe={"lr": 1e-3}, commit="abc", layout=LAYOUT))
+    )
     assert data["kind"] == "velocity_estimator"
     assert data["joint_names"] == list(JOINT_NAMES)
     assert data["state_shape"] == [1, 1, 64]
     layout = InputLayout.from_metadata(data["inputs"], features.KNOWN_INPUTS)
-    assert layout.terms == features.DEFAULT_LAYOUT.terms
+    assert layout.terms == LAYOUT.terms
 
 
 @pytest.mark.parametrize(
@@ -92,7 +98,7 @@ def test_the_metadata_carries_the_layout_through_json() -> None:
     ],
 )
 def test_a_layout_that_does_not_fit_is_refused_by_name(change: dict, sentence: str) -> None:
-    entries = features.DEFAULT_LAYOUT.to_metadata()
+    entries = LAYOUT.to_metadata()
     entries[0] |= change
     with pytest.raises(ValueError) as refused:  # noqa: PT011
         InputLayout.from_metadata(entries, features.KNOWN_INPUTS)

@@ -16,6 +16,7 @@ from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.state import RobotState
 from quadvel_estimator import features
 from quadvel_estimator.learned import LearnedEstimator
+from tests.helpers.robots import ALIENGO
 
 WriteEstimator = Callable[..., Path]
 State = Callable[..., RobotState]
@@ -26,9 +27,9 @@ ACTION = np.linspace(-0.3, 0.3, 12)
 def test_velocity_and_covariance_are_the_scaled_outputs(
     write_estimator: WriteEstimator, standing: State, weights: Array, variance: Array
 ) -> None:
-    estimator = LearnedEstimator(write_estimator(output_scale=0.5))
+    estimator = LearnedEstimator(ALIENGO, write_estimator(output_scale=0.5))
     state = standing(0.0, dq=np.linspace(-1.0, 1.0, 12))
-    product = features.build(state, ACTION) @ weights
+    product = features.build(ALIENGO, state, ACTION, features.default_layout(ALIENGO)) @ weights
     for step in range(3):
         velocity, covariance = estimator.update(state, ACTION)
         np.testing.assert_allclose(velocity, 0.5 * (product + step), atol=1e-5)
@@ -36,7 +37,7 @@ def test_velocity_and_covariance_are_the_scaled_outputs(
 
 
 def test_a_reset_clears_the_memory(write_estimator: WriteEstimator, standing: State) -> None:
-    estimator = LearnedEstimator(write_estimator())
+    estimator = LearnedEstimator(ALIENGO, write_estimator())
     first, _ = estimator.update(standing(0.0), ACTION)
     second, _ = estimator.update(standing(0.005), ACTION)
     estimator.reset()
@@ -48,30 +49,30 @@ def test_a_reset_clears_the_memory(write_estimator: WriteEstimator, standing: St
 def test_the_layout_in_the_file_decides_over_the_default(
     write_estimator: WriteEstimator, standing: State, weights: Array
 ) -> None:
-    backwards = InputLayout(features.DEFAULT_LAYOUT.terms[::-1])
+    backwards = InputLayout(features.default_layout(ALIENGO).terms[::-1])
     state = standing(0.0, dq=np.linspace(-1.0, 1.0, 12))
-    estimator = LearnedEstimator(write_estimator(inputs=backwards.to_metadata(), output_scale=1.0))
-    expected = features.build(state, ACTION, backwards) @ weights
+    estimator = LearnedEstimator(ALIENGO, write_estimator(inputs=backwards.to_metadata(), output_scale=1.0))
+    expected = features.build(ALIENGO, state, ACTION, backwards) @ weights
     np.testing.assert_allclose(estimator.update(state, ACTION)[0], expected, atol=1e-5)
 
 
 def test_an_input_that_is_not_finite_shows_as_an_error(
     write_estimator: WriteEstimator, standing: State
 ) -> None:
-    estimator = LearnedEstimator(write_estimator())
+    estimator = LearnedEstimator(ALIENGO, write_estimator())
     with pytest.raises(FloatingPointError, match=r"estimator\.onnx.* velocity is not finite"):
         estimator.update(standing(0.0, q=np.full(12, np.nan)), ACTION)
 
 
 def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(NetworkFileError, match=r"nowhere\.onnx: no such file"):
-        LearnedEstimator(tmp_path / "nowhere.onnx")
+        LearnedEstimator(ALIENGO, tmp_path / "nowhere.onnx")
 
 
 def test_a_file_that_is_no_network_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "notes.onnx").write_text("hello")
     with pytest.raises(NetworkFileError, match=r"notes\.onnx: is not an ONNX network"):
-        LearnedEstimator(tmp_path / "notes.onnx")
+        LearnedEstimator(ALIENGO, tmp_path / "notes.onnx")
 
 
 @pytest.mark.parametrize(
@@ -100,7 +101,7 @@ def test_a_foreign_file_is_refused_in_one_sentence(
     write_estimator: WriteEstimator, changes: dict[str, Any], sentence: str
 ) -> None:
     with pytest.raises(NetworkFileError) as refused:
-        LearnedEstimator(write_estimator(**changes))
+        LearnedEstimator(ALIENGO, write_estimator(**changes))
     assert sentence in str(refused.value)
     assert "estimator.onnx: " in str(refused.value)
     assert "\n" not in str(refused.value)

@@ -10,7 +10,7 @@ import pytest
 from quadvel_description import mjcf
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_eval.robot_loop import RobotLoop, TrueVelocity
-from quadvel_policy.observation import PolicyMetadata
+from quadvel_policy.observation import PolicyMetadata, default_observation
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 from tests.helpers.robots import ALIENGO
@@ -21,7 +21,9 @@ class StandingPolicy:
 
     def __init__(self) -> None:
         self.metadata = PolicyMetadata(
-            robot="aliengo",
+            robot=ALIENGO.name,
+            nominal_q=tuple(ALIENGO.nominal_q),
+            observation=default_observation(ALIENGO),
             action_offset=tuple(
                 ALIENGO.nominal_q + mjcf.gravity_torque(mjcf.load_model(ALIENGO)) / ALIENGO.kp
             ),
@@ -54,8 +56,8 @@ def make_loop() -> Callable[..., RobotLoop]:
     def make(seed: int = 0) -> RobotLoop:
         simulator = Simulator(SimulatorConfig(robot=ALIENGO, seed=seed))
         simulator.reset("stand")
-        beside = {"kalman": KalmanEstimator()}
-        loop = RobotLoop(simulator, Supervisor(StandingPolicy()), TrueVelocity(simulator), beside)
+        beside = {"kalman": KalmanEstimator(ALIENGO)}
+        loop = RobotLoop(simulator, Supervisor(ALIENGO, StandingPolicy()), TrueVelocity(simulator), beside)
         loop.start_walking()
         return loop
 

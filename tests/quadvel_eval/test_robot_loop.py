@@ -82,7 +82,7 @@ def test_the_supervisor_walks_on_the_estimate_of_the_state_before(standing_polic
 
 def test_a_refused_mode_raises_with_the_reason(standing_policy: Any) -> None:
     simulator = Simulator(SimulatorConfig(robot=ALIENGO))  # lies
-    loop = RobotLoop(simulator, Supervisor(standing_policy), TrueVelocity(simulator))
+    loop = RobotLoop(simulator, Supervisor(ALIENGO, standing_policy), TrueVelocity(simulator))
     with pytest.raises(RuntimeError, match=r"refused stance: .* off the nominal posture"):
         loop.start_walking()
 

@@ -17,8 +17,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 import quadvel_dds
-from quadvel_description.robot import KD, KP, NOMINAL_Q
-from quadvel_policy.observation import PolicyMetadata
+from quadvel_policy.observation import PolicyMetadata, default_observation
+from tests.helpers.robots import ALIENGO
 
 sys.path.insert(0, str(Path(__file__).parent))  # for `rig`
 quadvel_dds.install()  # before a test module imports rclpy
@@ -34,10 +34,12 @@ HIDDEN = 8
 def make_metadata(**changes: Any) -> PolicyMetadata:
     fields: dict[str, Any] = {
         "robot": "aliengo",
-        "action_offset": tuple(NOMINAL_Q + 0.1),
+        "nominal_q": tuple(ALIENGO.nominal_q),
+        "observation": default_observation(ALIENGO),
+        "action_offset": tuple(ALIENGO.nominal_q + 0.1),
         "action_scale": 0.25,
-        "kp": KP,
-        "kd": KD,
+        "kp": ALIENGO.kp,
+        "kd": ALIENGO.kd,
         "command_limits": {"vx": (-1.0, 1.5), "vy": (-0.5, 0.5), "wz": (-1.0, 1.0)},
         "state_shape": (1, 1, HIDDEN),
         "commit": "test",

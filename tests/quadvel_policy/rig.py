@@ -8,7 +8,6 @@ from typing import Any
 import attrs
 import numpy as np
 
-from quadvel_description.robot import LIE_Q
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_nodes.parameters import make_record
 from quadvel_policy.config import SupervisorConfig
@@ -16,6 +15,7 @@ from quadvel_policy.guard import Guard
 from quadvel_policy.guards import GUARDS
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import TickInput
+from tests.helpers.robots import ALIENGO
 
 PERIOD = 0.005
 STILL = (0.0, 0.0, 0.0, 1.0)
@@ -29,11 +29,11 @@ class Rig:
         self, policy: Any, guards: Iterable[type[Guard]] = GUARDS, backup: Any = None, **config: Any
     ) -> None:
         self.policy = policy
-        self.supervisor = Supervisor(policy, make_record(SupervisorConfig, config), backup, guards)
+        self.supervisor = Supervisor(ALIENGO, policy, make_record(SupervisorConfig, config), backup, guards)
         zeros = np.zeros(12)
         upright, down = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 9.81])
         self.state = RobotState(
-            100.0, 0, LIE_Q.copy(), zeros, zeros, upright, np.zeros(3), down, np.full(4, 60.0)
+            100.0, 0, ALIENGO.lie_q.copy(), zeros, zeros, upright, np.zeros(3), down, np.full(4, 60.0)
         )
         self.velocity: Any = np.zeros(3)
         self.inputs: dict[str, Any] = {}  # further fields of TickInput

@@ -8,6 +8,7 @@ import pytest
 
 from quadvel_policy.control_loop import ControlConfig, ControlLoop
 from quadvel_policy.supervisor import Supervisor
+from tests.helpers.robots import ALIENGO
 
 
 class Clocks:
@@ -26,7 +27,7 @@ class Clocks:
 def test_a_process_that_gets_no_time_between_two_clocks_does_not_set_one(policy: Any, nth: int) -> None:
     clocks = Clocks()
     loop = ControlLoop(
-        Supervisor(policy), ControlConfig(), lambda answer: None, clocks.read, steady=clocks.read
+        Supervisor(ALIENGO, policy), ControlConfig(), lambda answer: None, clocks.read, steady=clocks.read
     )
     clocks.left = nth
     loop.watch()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rig import FORWARD, PERIOD, STILL, Rig, assert_damping
 
-from quadvel_description.robot import ALIENGO, NOMINAL_Q, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
+from quadvel_description.robot import NOMINAL_Q, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy import command_limits
 from quadvel_policy.command_limits import LIMITS, JointCommandLimiter
@@ -23,6 +23,7 @@ from quadvel_policy.guards import GUARDS
 from quadvel_policy.guards.legs import EncoderInconsistent
 from quadvel_policy.supervisor import SUPERVISOR_FAULTS
 from quadvel_policy.tick_input import MotorStatus, TickInput
+from tests.helpers.robots import ALIENGO
 
 Changes = dict[str, Any]
 """Changes of the state of one tick, its age, or the time since the previous one"""

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.symmetry import mirror_observation
 from quadvel_policy.observation import (
-    DEFAULT_OBSERVATION,
     ActionMap,
     MetadataError,
     ObservationSpec,
     PolicyMetadata,
     build_observation,
+    default_observation,
 )
+from tests.helpers.robots import ALIENGO
 
 VALUES: dict[str, Any] = {
     "command": [0.5, -0.2, 0.8, 0.0],
@@ -43,7 +43,7 @@ GOLDEN = [
 
 
 def test_the_whole_observation_is_the_one_worked_out_by_hand() -> None:
-    observation = build_observation(DEFAULT_OBSERVATION, **VALUES)
+    observation = build_observation(default_observation(ALIENGO), **VALUES)
     assert observation.dtype == np.float32
     assert observation.shape == (48,)
     np.testing.assert_allclose(observation, GOLDEN, atol=1e-6)
@@ -52,28 +52,30 @@ def test_the_whole_observation_is_the_one_worked_out_by_hand() -> None:
 def test_leading_axes_give_the_same_numbers_and_out_is_filled() -> None:
     batch = {name: np.broadcast_to(value, (3, 2, len(value))) for name, value in VALUES.items()}
     out = np.full((3, 2, 48), np.nan, np.float32)
-    returned = build_observation(DEFAULT_OBSERVATION, out=out, **batch)
+    returned = build_observation(default_observation(ALIENGO), out=out, **batch)
     assert returned is out
     np.testing.assert_allclose(out, np.broadcast_to(GOLDEN, (3, 2, 48)), atol=1e-6)
 
 
 def test_roll_and_pitch_may_be_given_instead_of_the_quaternion() -> None:
     values = {name: value for name, value in VALUES.items() if name != "quaternion"}
-    observation = build_observation(DEFAULT_OBSERVATION, roll_pitch=[0.2, -0.4], **values)
+    observation = build_observation(default_observation(ALIENGO), roll_pitch=[0.2, -0.4], **values)
     np.testing.assert_allclose(observation, GOLDEN, atol=1e-6)
     with pytest.raises(TypeError, match="exactly one of quaternion and roll_pitch"):
-        build_observation(DEFAULT_OBSERVATION, **values)
+        build_observation(default_observation(ALIENGO), **values)
 
 
 def test_the_order_follows_the_specification() -> None:
-    reverse = ObservationSpec(DEFAULT_OBSERVATION.terms[::-1])
+    reverse = ObservationSpec(default_observation(ALIENGO).terms[::-1])
     observation = build_observation(reverse, **VALUES)
     np.testing.assert_allclose(observation[:12], GOLDEN[-12:], atol=1e-6)
     np.testing.assert_allclose(observation[-4:], GOLDEN[:4], atol=1e-6)
 
 
 def test_nan_stays_visible_in_the_observation() -> None:
-    observation = build_observation(DEFAULT_OBSERVATION, **VALUES | {"linear_velocity": [np.nan, 0.0, 0.0]})
+    observation = build_observation(
+        default_observation(ALIENGO), **VALUES | {"linear_velocity": [np.nan, 0.0, 0.0]}
+    )
     assert np.isnan(observation).sum() == 1
 
 
@@ -87,15 +89,15 @@ def test_the_mirrored_robot_sees_the_mirrored_observation() -> None:
         "angular_velocity": [-0.2, -0.4, -1.0],
         "previous_action": [-0.5, 0.0, 0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 11.0, 0.0, 0.0, 0.0],
     }
-    seen = build_observation(DEFAULT_OBSERVATION, **mirrored)
+    seen = build_observation(default_observation(ALIENGO), **mirrored)
     np.testing.assert_allclose(seen, mirror_observation(np.array(GOLDEN)), atol=1e-6)
 
 
 def test_targets_are_offset_plus_scale_times_the_clipped_action() -> None:
     action = np.array([0.1, -0.2, 9.0] * 4)
-    plain = ActionMap(NOMINAL_Q, 0.25, clip=2.0).targets(action)
+    plain = ActionMap(ALIENGO.nominal_q, 0.25, clip=2.0).targets(action)
     np.testing.assert_allclose(plain[:3], [0.025, 0.6435 - 0.05, -1.287 + 0.5])
-    pair = ActionMap(NOMINAL_Q, 0.25, clip=(-0.1, 1.0)).targets(np.stack([action, -action]))
+    pair = ActionMap(ALIENGO.nominal_q, 0.25, clip=(-0.1, 1.0)).targets(np.stack([action, -action]))
     np.testing.assert_allclose(pair[0, :3], [0.025, 0.6435 - 0.025, -1.287 + 0.25])
     np.testing.assert_allclose(pair[1, :3], [-0.025, 0.6435 + 0.05, -1.287 - 0.025])
 

@@ -14,6 +14,7 @@ from quadvel_description.ahead import split_network
 from quadvel_description.network_file import NetworkFileError, read_network
 from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from tests.helpers.robots import ALIENGO
 
 WritePolicy = Callable[..., Path]
 
@@ -36,7 +37,7 @@ def reference(path: Path, observations: np.ndarray) -> np.ndarray:
 
 def test_steps_carry_the_memory_as_the_lstm_equations_say(write_policy: WritePolicy) -> None:
     path = write_policy()
-    policy = PolicyFile(path)
+    policy = PolicyFile(ALIENGO, path)
     observations = np.random.default_rng(1).normal(size=(20, 48)).astype(np.float32)
     actions = np.array([policy.step(o) for o in observations])
     assert actions.shape == (20, 12)
@@ -44,7 +45,7 @@ def test_steps_carry_the_memory_as_the_lstm_equations_say(write_policy: WritePol
 
 
 def test_a_reset_clears_the_memory(write_policy: WritePolicy) -> None:
-    policy = PolicyFile(write_policy())
+    policy = PolicyFile(ALIENGO, write_policy())
     observations = np.random.default_rng(2).normal(size=(5, 48)).astype(np.float32)
     first = [policy.step(o) for o in observations]
     policy.reset()
@@ -54,7 +55,7 @@ def test_a_reset_clears_the_memory(write_policy: WritePolicy) -> None:
 @pytest.mark.parametrize("shipped", [True, False], ids=["shipped", "that can't be cut in two"])
 def test_a_prepared_policy_acts_as_one_that_is_not(write_policy: WritePolicy, shipped: bool) -> None:
     path = SHIPPED_POLICY if shipped else write_policy()
-    plain, prepared = PolicyFile(path), PolicyFile(path)
+    plain, prepared = PolicyFile(ALIENGO, path), PolicyFile(ALIENGO, path)
     observations = np.random.default_rng(3).normal(0.0, 0.3, (200, 48)).astype(np.float32)
     for tick, observation in enumerate(observations):
         if tick == 100:  # what was prepared belongs to the memory that is forgotten here
@@ -74,29 +75,29 @@ def test_most_of_the_shipped_policy_needs_no_observation() -> None:
 
 
 def test_the_metadata_comes_with_the_file(write_policy: WritePolicy, metadata: PolicyMetadata) -> None:
-    assert PolicyFile(write_policy()).metadata.to_json() == metadata.to_json()
+    assert PolicyFile(ALIENGO, write_policy()).metadata.to_json() == metadata.to_json()
 
 
 def test_an_output_that_is_not_finite_is_an_error(write_policy: WritePolicy) -> None:
-    policy = PolicyFile(write_policy(exponent=1.0))
+    policy = PolicyFile(ALIENGO, write_policy(exponent=1.0))
     with pytest.raises(FloatingPointError, match=r"policy\.onnx.* not finite"):
         policy.step(np.full(48, 1e3, np.float32))
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(NetworkFileError, match=r"absent\.onnx: no such file"):
-        PolicyFile(tmp_path / "absent.onnx")
+        PolicyFile(ALIENGO, tmp_path / "absent.onnx")
 
 
 def test_a_file_that_is_no_onnx_is_refused(tmp_path: Path) -> None:
     (tmp_path / "text.onnx").write_text("not a network")
     with pytest.raises(NetworkFileError, match=r"text\.onnx: is not an ONNX network"):
-        PolicyFile(tmp_path / "text.onnx")
+        PolicyFile(ALIENGO, tmp_path / "text.onnx")
 
 
 def test_a_foreign_onnx_without_metadata_is_refused(write_policy: WritePolicy) -> None:
     with pytest.raises(NetworkFileError, match=r"policy\.onnx: has no metadata under the key 'quadvel'"):
-        PolicyFile(write_policy(properties={"author": "someone"}))
+        PolicyFile(ALIENGO, write_policy(properties={"author": "someone"}))
 
 
 @pytest.mark.parametrize(
@@ -112,7 +113,7 @@ def test_a_network_of_another_form_is_refused(
     write_policy: WritePolicy, changes: dict, sentence: str
 ) -> None:
     with pytest.raises(NetworkFileError, match=rf"policy\.onnx.*{sentence}"):
-        PolicyFile(write_policy(**changes))
+        PolicyFile(ALIENGO, write_policy(**changes))
 
 
 @pytest.mark.parametrize(
@@ -130,7 +131,7 @@ def test_metadata_that_does_not_fit_is_refused_with_the_files_name(
 ) -> None:
     text = json.dumps(json.loads(metadata.to_json()) | {field: value})
     with pytest.raises(NetworkFileError, match=rf"policy\.onnx: .*{sentence}"):
-        PolicyFile(write_policy(properties={"quadvel": text}))
+        PolicyFile(ALIENGO, write_policy(properties={"quadvel": text}))
 
 
 def test_a_policy_without_a_name_is_that_of_the_aliengo(
@@ -138,4 +139,7 @@ def test_a_policy_without_a_name_is_that_of_the_aliengo(
 ) -> None:
     fields = json.loads(metadata.to_json())
     del fields["robot"]
-    assert PolicyFile(write_policy(properties={"quadvel": json.dumps(fields)})).metadata.robot == "aliengo"
+    assert (
+        PolicyFile(ALIENGO, write_policy(properties={"quadvel": json.dumps(fields)})).metadata.robot
+        == "aliengo"
+    )

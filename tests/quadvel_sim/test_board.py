@@ -14,7 +14,6 @@ import pytest
 from quadvel_description.kinematics import roll_pitch
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
-from quadvel_driver.aliengo import ALIENGO as DRIVEN
 from quadvel_driver.board_state import BoardState
 from quadvel_driver.calibration import Calibration
 from quadvel_driver.link import NO_CALIBRATION, Link
@@ -57,7 +56,7 @@ def link() -> Iterator[Callable[[Board], tuple[Link, list[BoardState]]]]:
             gains = {"kp": np.full(12, 150.0), "kd": np.full(12, 4.0)}
             made.submit(JointCommand(q=np.array(ALIENGO.nominal_q), tick=state.robot.tick, **gains))
 
-        made = Link(DRIVEN, wire, UdpTransport(config), config, hold, calibration)
+        made = Link(ALIENGO, wire, UdpTransport(config), config, hold, calibration)
         thread = threading.Thread(target=made.run)
         thread.start()
         ends.extend((made.stop, thread.join))

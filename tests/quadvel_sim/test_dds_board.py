@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from quadvel_description.robot import load_robot
 from quadvel_description.state import JointCommand
 from quadvel_driver.board_state import BoardState
 from quadvel_driver.link import Link, LinkConfig, LinkError
 from quadvel_driver.takeover import Access
 from quadvel_driver.unitree_dds import wire
 from quadvel_driver.unitree_dds.bus import Bus
-from quadvel_driver.unitree_dds.go2 import GO2
 from quadvel_driver.unitree_dds.motion_switcher import MotionSwitcher
 from quadvel_driver.unitree_dds.takeover import DdsTakeover
 from quadvel_driver.unitree_dds.transport import COMMAND_TOPIC, DdsTransport
@@ -34,6 +34,8 @@ from quadvel_sim.dds_board import DdsBoard
 from quadvel_sim.simulator import Simulator
 from tests.helpers import boards
 from tests.helpers.robots import ALIENGO
+
+GO2 = load_robot("go2")
 
 DOMAIN, INTERFACE = int(os.environ["ROS_DOMAIN_ID"]), "lo"
 PATIENCE_S = 40.0

@@ -16,7 +16,7 @@ from quadvel_description.state import MODE_SERVO, JointCommand
 from quadvel_eval.people.laser import FloorPlan
 from quadvel_eval.robot_loop import RobotLoop, TrueVelocity
 from quadvel_follow import PersonTracker
-from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim import Simulator, SimulatorConfig, Terrain, World
 from quadvel_sim.laser import Laser
@@ -252,7 +252,7 @@ def test_the_robot_stands_on_a_slope_of_15_degrees_under_its_policy() -> None:
     hill = Hill(position=[10.0, 0.0], size=[20.0, 10.0], height=1.0, slope=15.0)
     simulator = standing(World(hills=[hill]))
     on_slope(simulator, 15.0, 1.8)
-    loop = RobotLoop(simulator, Supervisor(PolicyFile(SHIPPED_POLICY)), TrueVelocity(simulator))
+    loop = RobotLoop(simulator, Supervisor(ALIENGO, PolicyFile(ALIENGO)), TrueVelocity(simulator))
     loop.start_walking()
     before = simulator.truth()
     samples = [loop.tick() for _ in range(200)]

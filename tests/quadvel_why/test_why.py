@@ -18,6 +18,7 @@ from quadvel_why.page import page
 from quadvel_why.reading import read_run
 from quadvel_why.run import Commands, Run
 from quadvel_why.signals import PARTS, Signals
+from tests.helpers.robots import ALIENGO
 
 ORDER = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
 
@@ -28,7 +29,7 @@ def run(walk: Path) -> Run:
 
 
 def examine(run: Run) -> Diagnosis:
-    return diagnose(Signals(run, PolicyFile()))
+    return diagnose(Signals(run, PolicyFile(ALIENGO)))
 
 
 def commands(run: Run, **fields: object) -> Run:
@@ -41,7 +42,7 @@ def imu(run: Run, **fields: object) -> Run:
 
 
 def scaled_targets(c: Commands) -> np.ndarray:
-    offset = np.array(PolicyFile().metadata.action_offset)
+    offset = np.array(PolicyFile(ALIENGO).metadata.action_offset)
     walks = np.isclose(c.kp, 30.0)
     return np.where(walks, offset + 0.6 * (c.q - offset), c.q)
 

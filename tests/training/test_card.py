@@ -17,6 +17,7 @@ from quadvel_eval.walk import Setup  # noqa: E402
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile  # noqa: E402
 from quadvel_training import __main__ as main  # noqa: E402
 from quadvel_training.card import SECTIONS, card  # noqa: E402
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 
 @pytest.fixture
@@ -38,7 +39,7 @@ def evaluation(tmp_path):
 
 
 def test_a_policys_card_names_its_figures_and_where_it_fails(evaluation):
-    text, metadata = card(SHIPPED_POLICY, [evaluation]), PolicyFile().metadata
+    text, metadata = card(SHIPPED_POLICY, [evaluation]), PolicyFile(ALIENGO).metadata
     low, high = metadata.command_limits["vx"]
     for said in (
         f"| samples | {metadata.recipe['samples']} |",
@@ -118,9 +119,9 @@ def test_a_policys_known_limits_follow_from_the_papers_sections(evaluation, tmp_
 def test_limits_of_commands_are_narrowed_in_the_file_and_the_network_stays(tmp_path):
     path = tmp_path / "policy.onnx"
     path.write_bytes(SHIPPED_POLICY.read_bytes())
-    before = PolicyFile(path)
+    before = PolicyFile(ALIENGO, path)
     main.limit(path, forward=1.5, turn=0.7)
-    after = PolicyFile(path)
+    after = PolicyFile(ALIENGO, path)
     vx, vy = (before.metadata.command_limits[axis] for axis in ("vx", "vy"))
     assert after.metadata.command_limits == {"vx": (vx[0], 1.5), "vy": vy, "wz": (-0.7, 0.7)}
     kept, now = (json.loads(one.metadata.to_json()) for one in (before, after))

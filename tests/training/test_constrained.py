@@ -13,6 +13,7 @@ from quadvel_training import constrained, loop  # noqa: E402
 from quadvel_training.constrained import ConstrainedConfig, ConstrainedRun  # noqa: E402
 from quadvel_training.dagger import DaggerConfig, DaggerRun  # noqa: E402
 from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun  # noqa: E402
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 SMALL = ConstrainedConfig(n=8, threads=1, length=8, critic_first=0, pull_samples=1e4, constraint_samples=1e4)
 
@@ -109,7 +110,7 @@ def test_a_start_of_its_own_brings_its_critic_and_needs_no_teacher(files, tmp_pa
 def test_the_policy_file_answers_as_the_network_does(files, tmp_path):
     run = ConstrainedRun(SMALL, *files)
     run.write_policy(tmp_path / "policy.onnx", {})
-    policy = PolicyFile(tmp_path / "policy.onnx")
+    policy = PolicyFile(ALIENGO, tmp_path / "policy.onnx")
     obs = np.random.default_rng(0).normal(size=(5, 48)).astype(np.float32)
     with torch.no_grad():
         expected, _ = run.policy()(torch.from_numpy(obs[:, None]), run.policy().initial_state(1))

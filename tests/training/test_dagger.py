@@ -13,6 +13,7 @@ from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import dagger, loop  # noqa: E402
 from quadvel_training.dagger import DaggerConfig, DaggerRun  # noqa: E402
 from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun  # noqa: E402
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 SMALL = DaggerConfig(n=8, threads=1, length=6, mini_batches=2, learning_rate=3e-3)
 
@@ -46,7 +47,7 @@ def test_the_file_is_the_papers_network_and_nothing_else(run, tmp_path):
 
 def test_the_file_does_what_the_network_does(run, tmp_path):
     dagger.export_policy(run.student, run.env, run.grid.config.answered, tmp_path / "policy.onnx", {})
-    policy = PolicyFile(tmp_path / "policy.onnx")
+    policy = PolicyFile(ALIENGO, tmp_path / "policy.onnx")
     obs = np.random.default_rng(0).normal(size=(50, 48)).astype(np.float32)
     with torch.no_grad():
         expected, _ = run.student(torch.from_numpy(obs[:, None]), run.student.initial_state(1))
@@ -57,7 +58,7 @@ def test_the_file_does_what_the_network_does(run, tmp_path):
 def test_the_file_holds_its_command_limits_and_how_to_run_it(run, tmp_path):
     limits = VelocityCommandLimits((-1.0, -0.4, -0.7), (2.0, 0.5, 0.7), 3.0)
     dagger.export_policy(run.student, run.env, limits, tmp_path / "policy.onnx", {})
-    metadata = PolicyFile(tmp_path / "policy.onnx").metadata
+    metadata = PolicyFile(ALIENGO, tmp_path / "policy.onnx").metadata
     assert metadata.limits == limits
     assert np.allclose(metadata.action_offset, run.env.stand_q)
     assert metadata.kp == (30.0,) * 12

@@ -50,7 +50,7 @@ def test_postures_are_those_of_the_controller(monkeypatch):
         modes.set_targets(np.zeros((1, 12)), ALIENGO.kp, ALIENGO.kd)
         modes.advance(q[None])
     c = SupervisorConfig()
-    fold = Posture([(c.fold_time, ALIENGO.lie_q)], c.stand_kp, c.stand_kd)
+    fold = Posture(ALIENGO, [(c.fold_time, ALIENGO.lie_q)], c.stand_kp, c.stand_kd)
     state = RobotState(
         0.0, 0, q, np.zeros(12), np.zeros(12), np.array([1.0, 0, 0, 0]), *np.zeros((2, 3)), np.zeros(4)
     )
@@ -122,7 +122,7 @@ KEEP = 4
 def believing(which: int) -> VelocityNetwork:
     """A network without corrections whose only share is that of a leg, 0 to 3, or of inertia, 4."""
     torch.manual_seed(0)
-    network = VelocityNetwork()
+    network = VelocityNetwork(features.default_layout(ALIENGO))
     last = network.body[-1]
     with torch.no_grad():
         last.weight.zero_()
@@ -133,7 +133,7 @@ def believing(which: int) -> VelocityNetwork:
 
 def seen(sensed: RobotState, ticks: int) -> torch.Tensor:
     """The network's input (T, 1, 69) of a constant state."""
-    x = features.build(sensed, np.zeros(12))
+    x = features.build(ALIENGO, sensed, np.zeros(12), features.default_layout(ALIENGO))
     return torch.from_numpy(np.tile(x, (ticks, 1, 1)))
 
 
@@ -157,7 +157,9 @@ def test_the_network_can_believe_one_leg():
     with torch.no_grad():
         output, _ = network(seen(state, 2), network.initial_state(1))
     np.testing.assert_allclose(
-        output[1, 0, :3].numpy(), leg_velocity(state, rotation_matrix(state.quaternion))[2], atol=1e-5
+        output[1, 0, :3].numpy(),
+        leg_velocity(ALIENGO, state, rotation_matrix(state.quaternion))[2],
+        atol=1e-5,
     )
 
 
@@ -179,13 +181,18 @@ def test_a_trained_network_runs_as_a_file(tmp_path, actor):
     run = EstimatorRun(EstimatorConfig(n=8, length=4, mini_batches=2), actor)
     run.step(0.9)
     run.export(tmp_path / "estimator.onnx", {"stage": "test"})
-    estimator = LearnedEstimator(tmp_path / "estimator.onnx")
+    estimator = LearnedEstimator(ALIENGO, tmp_path / "estimator.onnx")
     sensed = run.walks[0].walks.sense()
     action = run.walks[0].walks.previous_action
     state = run.network.initial_state(4)
     for _ in range(3):
         with torch.no_grad():
-            output, state = run.network(torch.from_numpy(features.build(sensed, action)[None]), state)
+            output, state = run.network(
+                torch.from_numpy(
+                    features.build(ALIENGO, sensed, action, features.default_layout(ALIENGO))[None]
+                ),
+                state,
+            )
         arrays = {k: v[0] for k, v in attrs.asdict(sensed).items() if isinstance(v, np.ndarray)}
         velocity, covariance = estimator.update(attrs.evolve(sensed, **arrays), action[0])
         np.testing.assert_allclose(velocity, output[0, 0, :3].numpy(), atol=1e-5)

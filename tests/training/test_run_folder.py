@@ -10,7 +10,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
 from quadvel_actuator import ActuatorParameters, Effect  # noqa: E402
-from quadvel_description.robot import JOINT_NAMES  # noqa: E402
+from quadvel_description.quadruped import JOINT_NAMES  # noqa: E402
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import loop, run_folder, stages  # noqa: E402
 from quadvel_training.constrained import ConstrainedConfig  # noqa: E402
@@ -47,7 +47,10 @@ def test_a_run_keeps_what_it_is_and_how_it_fared(tmp_path, monkeypatch, drives):
     assert kept == [f"000000k.{suffix}" for suffix in ("json", "onnx", "pt")]
     assert json.loads((folder / "kept" / kept[0]).read_text()) == figures
     assert [one.plant["actuator"] for one in setups] == [ActuatorParameters.load(drives)]
-    assert PolicyFile(folder / "kept" / kept[1]).metadata.actuator["effects"][0]["name"] == "coulomb_friction"
+    assert (
+        PolicyFile(ALIENGO, folder / "kept" / kept[1]).metadata.actuator["effects"][0]["name"]
+        == "coulomb_friction"
+    )
     assert loop.load(folder / "kept" / kept[2])["samples"] == 12
 
     training_record = run_folder.training_record("constrained", None, config, folder / stages.POLICY)

@@ -17,6 +17,7 @@ from quadvel_why.diagnosis import LIMITS_FILE
 from quadvel_why.links import CAUSES
 from quadvel_why.reading import read_run
 from quadvel_why.signals import Signals
+from tests.helpers.robots import ALIENGO
 from tests.why.walks import Defect, RecordedWalk, make_script
 
 FIRST_SEED = 900
@@ -29,7 +30,7 @@ def main(
     out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("out/why_limits"),
 ) -> None:
     """Measure healthy walks."""
-    policy = PolicyFile()
+    policy = PolicyFile(ALIENGO)
     largest: dict[str, float] = {}
     for seed in range(FIRST_SEED, FIRST_SEED + walks):
         path = out / f"{seed}.mcap"

@@ -22,6 +22,7 @@ from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import diagnose
 from quadvel_why.reading import read_run
 from quadvel_why.signals import Signals
+from tests.helpers.robots import ALIENGO
 from tests.why.cases import STRENGTHS, Case, all_cases, record
 from tests.why.defects import ALSO_RIGHT
 
@@ -105,7 +106,7 @@ def main(
     rounds: Annotated[int, typer.Option(help="Strengths, from weak to strong.")] = STRENGTHS,
 ) -> None:
     """Measure the diagnosis."""
-    policy, wanted = PolicyFile(), set(filter(None, kinds.split(",")))
+    policy, wanted = PolicyFile(ALIENGO), set(filter(None, kinds.split(",")))
     folder = out / f"suite_{suite}"
     folder.mkdir(parents=True, exist_ok=True)
     results = []

@@ -17,7 +17,7 @@ from quadvel_bringup.recording_file import RawMessage, RecordingFile
 from quadvel_description.arrays import Array
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator.features import previous_action
-from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
+from quadvel_estimator.learned import LearnedEstimator
 from quadvel_policy.command_mux import CommandMux, MuxInput
 from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.modes import Policy
@@ -150,8 +150,8 @@ class RecordedWalk:
         defect.begin(self.simulator)
         # The posture may lean further than usual, so that walks can begin on steep ground.
         config = SupervisorConfig(max_posture_error=1.0)
-        self.supervisor = Supervisor(defect.policy(PolicyFile()), config)
-        self.estimator = LearnedEstimator(SHIPPED_MODEL)
+        self.supervisor = Supervisor(ALIENGO, defect.policy(PolicyFile(ALIENGO)), config)
+        self.estimator = LearnedEstimator(ALIENGO)
         self.mux = CommandMux([PLANNER])
         self.velocity: Array | None = None
         self.action = np.zeros(12)
@@ -224,7 +224,7 @@ class RecordedWalk:
         if not np.isfinite(perceived.q).all():
             return  # the node refuses it
         answer = self.supervisor.tick(TickInput(now, perceived, self.velocity, commanded, motors=motors))
-        self.action = previous_action(answer.q, answer.mode)
+        self.action = previous_action(ALIENGO, answer.q, answer.mode)
         sent = self.simulator.steps + self.defect.latency_ms()
         self._record_command(answer, 1_000_000 * sent)
         copy = attrs.evolve(answer, **{f: getattr(answer, f).copy() for f in ("q", "dq", "tau", "kp", "kd")})

@@ -19,7 +19,7 @@ import typer
 from typing_extensions import override
 
 from quadvel_description import symmetry
-from quadvel_policy.observation import DEFAULT_OBSERVATION
+from quadvel_policy.observation import OBSERVATION_SIZE
 
 from . import constrained, dagger, networks
 from .constrained import ConstrainedConfig, ConstrainedRun
@@ -31,7 +31,7 @@ try:
 except ModuleNotFoundError:
     raise SystemExit("This comparison needs cusrl: pip install cusrl==1.2.2") from None
 
-OBS = DEFAULT_OBSERVATION.size
+OBS = OBSERVATION_SIZE
 STATE = constrained.CRITIC_SIZE
 CRITIC = (256, 128, 64)
 MIRROR_OBS, MIRROR_ACTION = torch_mirror(symmetry.OBSERVATION), torch_mirror(symmetry.JOINTS)

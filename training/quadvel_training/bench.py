@@ -18,7 +18,7 @@ from quadvel_description.arrays import Array
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_eval.bench import Benchmark
-from quadvel_policy.observation import DEFAULT_OBSERVATION
+from quadvel_policy.observation import OBSERVATION_SIZE
 
 from . import dagger
 from .constrained import CRITIC_SIZE, PARTS, ConstrainedConfig, ConstrainedRun
@@ -103,7 +103,7 @@ def _bare_parts(run: ConstrainedRun) -> dict[str, tuple[Callable[[], object], fl
 
     The passes are inference, and forward and backward passes of actor, mirrored actor and critic.
     """
-    config, size = run.config, DEFAULT_OBSERVATION.size
+    config, size = run.config, OBSERVATION_SIZE
     p, n, length = config.ppo, config.n, config.length
     actor, critic = Recurrent(size, 12), Mlp(CRITIC_SIZE, 1)
     one, state = torch.randn(1, n, size), actor.initial_state(n)

@@ -20,7 +20,7 @@ import torch
 from quadvel_description import symmetry
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
-from quadvel_policy.observation import DEFAULT_OBSERVATION
+from quadvel_policy.observation import OBSERVATION_SIZE
 from quadvel_sim.terrain import Terrain
 
 from . import dagger, privileged, process_group
@@ -147,7 +147,7 @@ class ConstrainedRun:
         self.teacher = dagger.Teacher(load(teacher), self.env, self.past) if teacher else None
         self.rewards = Table2(self.env, c.rewards)
         self.scorer = CommandScorer(c.n)
-        network = dagger.load_policy(start) if start else Recurrent(DEFAULT_OBSERVATION.size, 12)
+        network = dagger.load_policy(start) if start else Recurrent(OBSERVATION_SIZE, 12)
         self.actor = Gaussian(network, 12, c.std).to(self.device)
         self.actor.log_std.requires_grad_(False)
         self.average: Recurrent = copy.deepcopy(self.actor.network)

@@ -24,11 +24,12 @@ from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_policy.observation import (
     COMMAND_AXES,
-    DEFAULT_OBSERVATION,
+    OBSERVATION_SIZE,
     ActionMap,
     PolicyMetadata,
     VelocityCommandLimits,
     build_observation,
+    default_observation,
 )
 from quadvel_sim.terrain import Terrain
 
@@ -188,7 +189,7 @@ class DaggerRun:
         self.env = VelocityEnv(env_config, self.grid)
         self.past = Past(self.env)
         self.teacher = Teacher(checkpoint, self.env, self.past)
-        self.student = Recurrent(DEFAULT_OBSERVATION.size, 12)
+        self.student = Recurrent(OBSERVATION_SIZE, 12)
         self.map = action_map(self.env)
         self.optimiser = torch.optim.Adam(self.student.parameters(), lr=c.learning_rate)
         self.samples = 0
@@ -358,7 +359,7 @@ def load_policy(checkpoint: Path) -> Recurrent:
         FileNotFoundError: there is no such file.
         CheckpointError: the checkpoint has no policy.
     """
-    content, network = load(checkpoint), Recurrent(DEFAULT_OBSERVATION.size, 12)
+    content, network = load(checkpoint), Recurrent(OBSERVATION_SIZE, 12)
     weights = content.get("average") or content.get("student")
     if weights is None:
         raise CheckpointError(f"{checkpoint}: expected a checkpoint of `dagger` or of `constrained`")
@@ -391,7 +392,7 @@ def observe(env: VelocityEnv, previous: np.ndarray) -> np.ndarray:
         (n, 48).
     """
     return build_observation(
-        DEFAULT_OBSERVATION, command=env.command, previous_action=previous, **env.sense()
+        default_observation(env.robot), command=env.command, previous_action=previous, **env.sense()
     )
 
 
@@ -415,6 +416,7 @@ def export_policy(
         kp=(env.config.kp,) * 12,
         kd=(env.config.kd,) * 12,
         nominal_q=tuple(env.robot.nominal_q),
+        observation=default_observation(env.robot),
         command_limits=dict(zip(COMMAND_AXES, zip(limits.low, limits.high, strict=True), strict=True)),
         curve_limit=limits.curve,
         state_shape=tuple(network.initial_state(1)[0].shape),
@@ -422,4 +424,4 @@ def export_policy(
         recipe=about,
         commit=commit(),
     )
-    export(network, DEFAULT_OBSERVATION.size, path, ["actions"], metadata.to_json())
+    export(network, OBSERVATION_SIZE, path, ["actions"], metadata.to_json())

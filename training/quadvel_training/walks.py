@@ -16,7 +16,7 @@ from quadvel_description.command_range import clip_to_command_range
 from quadvel_description.robot import Robot
 from quadvel_description.state import RobotState
 from quadvel_policy.config import SupervisorConfig
-from quadvel_policy.observation import DEFAULT_OBSERVATION, build_observation
+from quadvel_policy.observation import build_observation, default_observation
 from quadvel_sim.config import SensorNoise
 from quadvel_sim.terrain import Terrain
 
@@ -282,7 +282,7 @@ class Walks:
         command = env.command.copy()
         command[modes.mode == Mode.STOP] = [0.0, 0.0, 0.0, 1.0]
         obs = build_observation(
-            DEFAULT_OBSERVATION,
+            default_observation(env.robot),
             command=command,
             quaternion=state.quaternion,
             q=state.q,

@@ -3,7 +3,7 @@
 `Stack` names these nodes; follow.launch.py starts the planner that follows a person.
 
 ros2 launch quadvel_bringup robot.launch.py terrain:=rough
-ros2 launch quadvel_bringup robot.launch.py low_level:=aliengo
+ros2 launch quadvel_bringup robot.launch.py low_level:=driver robot:=aliengo
 """
 
 from pathlib import Path
@@ -20,7 +20,10 @@ from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
 
 ARGUMENTS = [
     DeclareLaunchArgument(
-        "low_level", default_value="sim", choices=list(LOW_LEVELS), description="the robot"
+        "low_level", default_value="sim", choices=list(LOW_LEVELS), description="simulated or real robot"
+    ),
+    DeclareLaunchArgument(
+        "robot", default_value="", description="aliengo, go2 or a robot.yaml; empty: aliengo"
     ),
     DeclareLaunchArgument("policy", default_value="", description="ONNX file; empty: the shipped one"),
     DeclareLaunchArgument(
@@ -56,6 +59,7 @@ def start(context: LaunchContext) -> list[Action]:
     chosen = {name: LaunchConfiguration(name).perform(context) for name in NAMES}
     stack = Stack(
         low_level=chosen["low_level"],
+        robot=chosen["robot"] or None,
         policy=Path(chosen["policy"]) if chosen["policy"] else None,
         actuator=Path(chosen["actuator"]) if chosen["actuator"] else None,
         terrain=chosen["terrain"] or None,

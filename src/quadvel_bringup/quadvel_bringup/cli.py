@@ -12,6 +12,8 @@ import attrs
 import typer
 from typer.core import TyperGroup
 
+from quadvel_description.robot_name import DEFAULT_ROBOT
+
 from .installation import check_installed
 from .nodes import NODES
 from .stack import PARAMETERS, Stack
@@ -257,11 +259,15 @@ def run(
 @app.command(rich_help_panel=ROBOT)
 def up(
     low_level: Annotated[
-        Literal["sim", "board", "aliengo", "external"],
+        Literal["sim", "board", "driver", "external"],
         typer.Option(
-            help="simulator; simulator behind the AlienGo's UDP interface; the AlienGo; or a robot served elsewhere."
+            help="simulator; simulator behind the UDP interface of a board; a real robot; or one that is served elsewhere."
         ),
     ] = "sim",
+    robot: Annotated[
+        str | None,
+        typer.Option(metavar="<name|file>", help="aliengo, go2 or a robot.yaml.", show_default=DEFAULT_ROBOT),
+    ] = None,
     policy: Annotated[
         Path | None,
         typer.Option(metavar="<file>", help="ONNX file of the policy.", show_default="the shipped one"),
@@ -292,7 +298,7 @@ def up(
     ] = PARAMETERS,
     view: Annotated[bool, typer.Option("--view", help="Serve the operator page in the browser.")] = False,
 ) -> None:
-    """Start a robot: simulated, the AlienGo, or a running one.
+    """Start a robot: simulated, real, or a running one.
 
     Low-level interface, estimator, controller and command mux run as processes; Ctrl-C stops them.
 
@@ -306,6 +312,7 @@ def up(
 
     stack = Stack(
         low_level=low_level,
+        robot=robot,
         policy=policy,
         terrain=terrain,
         world=world,

@@ -215,7 +215,7 @@ def abilities(findings: list[Finding]) -> Iterator[tuple[str, bool]]:
     runs = good["Python"] and all(good[name] for name in REQUIRED_PACKAGES)
     robot = good["Python"] and all(good[name] for name in ROBOT_PACKAGES)
     torch = any(finding.subject == "torch" and "training can run" in finding.text for finding in findings)
-    yield "a robot's nodes (quadvel up --low-level aliengo), drive, status", robot
+    yield "a robot's nodes (quadvel up --low-level driver), drive, status", robot
     yield "quadvel demo, up, run, record", runs
     yield "quadvel eval, bench", runs
     yield "the video of the demo", runs and good["GL"] and good["ffmpeg"]

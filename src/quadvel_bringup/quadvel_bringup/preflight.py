@@ -17,6 +17,7 @@ import attrs
 
 import quadvel_dds
 from quadvel_dds.arguments import InvalidROSArgsError, ParameterOverride, parse, read_parameter_file
+from quadvel_description.robot import load_robot
 from quadvel_nodes.parameters import make_record, parameter_fields
 
 from .nodes import NODES, installed_node, node_entry
@@ -40,10 +41,22 @@ class NodeCheck:
 
 
 def _policy(settings: Any) -> object:
-    """Load the policy, if one is given."""
-    from quadvel_policy.policy_file import PolicyFile
+    """Check the limits, and load the policy; a shipped one has to exist."""
+    from quadvel_policy.policy_file import PolicyFile, shipped_policy
 
-    return PolicyFile(Path(settings.policy)) if settings.policy else None
+    robot = load_robot(settings.robot)
+    settings.control.supervisor.check(robot)
+    return PolicyFile(robot, settings.policy) if settings.policy else shipped_policy(robot)
+
+
+def _estimator(settings: Any) -> object:
+    """Make the estimator; a shipped one has to exist."""
+    from quadvel_estimator.learned import shipped_estimator
+
+    robot = load_robot(settings.robot)
+    if settings.kind == "learned" and not settings.model:
+        return shipped_estimator(robot)
+    return settings.make_estimator(robot)
 
 
 # Skip the shipped networks: they are tested and slow to load.
@@ -55,10 +68,7 @@ NODE_CHECKS = {
     "driver": NodeCheck(
         "quadvel_driver.parameters:DriverParameters", lambda settings: settings.load_calibration()
     ),
-    "estimator": NodeCheck(
-        "quadvel_estimator.estimator:EstimatorParameters",
-        lambda settings: settings.make_estimator() if settings.model else None,
-    ),
+    "estimator": NodeCheck("quadvel_estimator.estimator:EstimatorParameters", _estimator),
     "controller": NodeCheck("quadvel_policy.controller:ControllerParameters", _policy),
     "command_mux": NodeCheck(
         "quadvel_policy.command_mux_node:MuxParameters", lambda settings: settings.inputs()
@@ -74,20 +84,37 @@ def check_stack(stack: Stack) -> None:
     """
     quadvel_dds.install()
     _check_file(stack.parameters)
+    robots = {}
     for name, arguments in stack.arguments().items():
         if name in NODE_CHECKS:
-            check_node(name, arguments)
+            settings = check_node(name, arguments)
+            if hasattr(settings, "robot"):
+                robots[name] = settings.robot
+    _check_same_robot(robots)
 
 
-def check_node(name: str, arguments: Sequence[str]) -> None:
+def check_node(name: str, arguments: Sequence[str]) -> Any:
     """Check one node of NODE_CHECKS.
 
     Args:
         name: The node.
         arguments: Its arguments of ROS 2.
+
+    Returns:
+        The record of its parameters.
     """
     installed_node(name)
-    _check(name, NODE_CHECKS[name], parse(arguments).parameters_for(f"/{name}"))
+    return _check(name, NODE_CHECKS[name], parse(arguments).parameters_for(f"/{name}"))
+
+
+def _check_same_robot(robots: Mapping[str, str]) -> None:
+    """Check that all nodes are those of one robot; `robots`: by name of the node, the robot's own first."""
+    first, *others = robots
+    for name in others:
+        if robots[name] != robots[first]:
+            raise ValueError(
+                f"{name}: robot is {robots[name]!r}, expected {robots[first]!r}, the robot of {first}"
+            )
 
 
 def check_arguments(name: str, arguments: Sequence[str]) -> None:
@@ -161,8 +188,8 @@ def _hint(found: str, known: Iterable[str]) -> str:
     return f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
 
 
-def _check(name: str, part: NodeCheck, values: Mapping[str, Any]) -> None:
-    """Check names, types and values of the parameters of a node."""
+def _check(name: str, part: NodeCheck, values: Mapping[str, Any]) -> Any:
+    """Check names, types and values of the parameters of a node; return their record."""
     module, _, record = part.record.partition(":")
     kind = getattr(import_module(module), record)
     defaults = {name: field.default for name, field in parameter_fields(kind).items()}
@@ -177,6 +204,8 @@ def _check(name: str, part: NodeCheck, values: Mapping[str, Any]) -> None:
             raise ValueError(f"{name}: {parameter} is {value!r}, expected a {expected}")
     given = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items() if key in defaults}
     try:
-        part.make(make_record(kind, given))
+        settings = make_record(kind, given)
+        part.make(settings)
+        return settings
     except ValueError as error:
         raise ValueError(f"{name}: {error.args[0]}") from error

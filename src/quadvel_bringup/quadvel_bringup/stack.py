@@ -47,7 +47,7 @@ def _on_loopback() -> dict[str, Parameters]:
     port = BOARD_PORT + (int(domain) if domain.isdecimal() else 0)
     return {
         "board": {"port": port},
-        "driver": {"board_address": "127.0.0.1", "board_port": port, "local_port": 0},
+        "driver": {"board_address": "127.0.0.1", "board_port": port, "local_port": 0, "dds_domain": 1},
     }
 
 
@@ -57,7 +57,7 @@ _BY_OPERATOR: Parameters = {"auto_stand": False, "require_operator": True}
 LOW_LEVELS = {
     "sim": LowLevel({"sim_node": {}}, {"auto_stand": True, "robot_waits": True}, simulation="sim_node"),
     "board": LowLevel(_on_loopback(), {"auto_stand": True}, simulation="board"),
-    "aliengo": LowLevel({"driver": URGENT}, _BY_OPERATOR, urgent=True),
+    "driver": LowLevel({"driver": URGENT}, _BY_OPERATOR, urgent=True),
     "external": LowLevel({}, _BY_OPERATOR),  # started elsewhere, possibly a real robot
 }
 
@@ -69,6 +69,7 @@ class Stack:
     Attributes:
         low_level: Key of LOW_LEVELS.
         parameters: Parameter file.
+        robot: Name of the robot, or path of a robot.yaml.
         policy: ONNX file of the policy.
         terrain: "flat", "slope" or "rough".
         world: Name or file of a world.
@@ -81,6 +82,7 @@ class Stack:
 
     low_level: str = attrs.field(default="sim", validator=attrs.validators.in_(LOW_LEVELS))
     parameters: Path = attrs.field(default=PARAMETERS, converter=Path)
+    robot: str | None = None
     policy: Path | None = None
     terrain: str | None = None
     world: str | None = None
@@ -118,16 +120,17 @@ class Stack:
         low_level = LOW_LEVELS[self.low_level]
         policy = None if self.policy is None else str(self.policy.resolve())
         urgent: Parameters = URGENT if low_level.urgent else {}
+        robot = _given(robot=_absolute_file(self.robot))
         followers: dict[str, Parameters] = {
-            "estimator": {**urgent, **_given(kind=self.estimator)},
-            "controller": {**low_level.controller, **urgent, **_given(policy=policy)},
+            "estimator": {**urgent, **robot, **_given(kind=self.estimator)},
+            "controller": {**low_level.controller, **urgent, **robot, **_given(policy=policy)},
             "command_mux": _given(),
         }
         actuator = None if self.actuator is None else str(self.actuator.resolve())
-        simulated = _given(terrain=self.terrain, world=_absolute_world(self.world), actuator_file=actuator)
+        simulated = _given(terrain=self.terrain, world=_absolute_file(self.world), actuator_file=actuator)
         if simulated and not low_level.simulation:
             raise ValueError(f"{', '.join(simulated)}: only a simulated robot has this, not {self.low_level}")
-        serving = dict(low_level.nodes)
+        serving = {name: {**values, **robot} for name, values in low_level.nodes.items()}
         if low_level.simulation:
             mode = _given(mode="lockstep" if self.use_sim_time else None)
             own = serving[low_level.simulation]
@@ -160,9 +163,9 @@ class Stack:
         return {name: process_command(name, words) for name, words in self.arguments(view).items()}
 
 
-def _absolute_world(world: str | None) -> str | None:
-    """Return the absolute path of a world's file, or the name of a shipped world unchanged."""
-    return str(Path(world).resolve()) if world and Path(world).suffix else world
+def _absolute_file(chosen: str | None) -> str | None:
+    """Return the absolute path of the file of a world or robot, or the name of a shipped one unchanged."""
+    return str(Path(chosen).resolve()) if chosen and Path(chosen).suffix else chosen
 
 
 def _given(**values: str | None) -> Parameters:

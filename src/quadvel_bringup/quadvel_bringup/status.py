@@ -37,7 +37,7 @@ STATUS_TOPICS = {
     "odom": Odometry,
     "velocity_estimate": TwistWithCovarianceStamped,
 }
-FILE_KEYS = ("actuator", "policy")
+FILE_KEYS = ("robot", "actuator", "policy")
 """Keys of /diagnostics with the files of a node."""
 RATES = ("low_state", "velocity_estimate", "controller/state", "command", "odom")
 LEVELS = {

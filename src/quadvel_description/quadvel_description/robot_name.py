@@ -2,7 +2,47 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 DEFAULT_ROBOT = "aliengo"
 """Robot of commands, nodes and recipes that name none."""
 UNNAMED_ROBOT = "aliengo"
 """Robot of a file without a name; such files are older than the names."""
+
+
+def shipped_file(folder: Path, robot: str, name: str) -> Path:
+    """Find a file that is shipped for a robot: in the subfolder of its name.
+
+    Those of UNNAMED_ROBOT are in the folder itself.
+
+    Args:
+        folder: Folder of the files of all robots.
+        robot: Name of the robot.
+        name: Name of the file.
+
+    Returns:
+        The file.
+
+    Raises:
+        FileNotFoundError: There is none for this robot.
+    """
+    path = folder / name if robot == UNNAMED_ROBOT else folder / robot / name
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path}: no such file is shipped for the robot {robot!r}; name one of your own"
+        )
+    return path
+
+
+def described_robot(urdf: str) -> str | None:
+    """Read the name of the robot in a URDF, such as on the topic `robot_description`.
+
+    Args:
+        urdf: The XML.
+
+    Returns:
+        The name, or None if there is none.
+    """
+    found = re.search(r"""<robot\b[^>]*\bname\s*=\s*["']([^"']+)""", urdf)
+    return found[1] if found else None

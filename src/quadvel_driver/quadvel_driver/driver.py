@@ -22,6 +22,7 @@ from rclpy.node import Node
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 
+from quadvel_description.robot import Robot
 from quadvel_msgs.msg import LowCmd, LowState, MotorStatus
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
@@ -33,7 +34,6 @@ from quadvel_nodes.system_time import SystemTime
 
 from .board_state import BoardState
 from .decimator import Decimator
-from .driven_robot import DrivenRobot
 from .dry_run import DryRun
 from .health import Health, Level, diagnostic_values, dropped_out
 from .link import SILENCE_LIMIT_S
@@ -229,7 +229,7 @@ class Driver(Node):
             self.get_logger().warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
 
 
-def motor_status(stamp: Any, state: BoardState, robot: DrivenRobot) -> Any:
+def motor_status(stamp: Any, state: BoardState, robot: Robot) -> Any:
     """Build the motor_status message of a state.
 
     Args:

@@ -7,7 +7,9 @@ from collections import Counter
 
 from typing_extensions import override
 
-from .driven_robot import DrivenRobot
+from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import Robot
+
 from .link import Transport, WireFormat
 
 SHOWN_BYTES = 11
@@ -17,7 +19,7 @@ SHOWN_BYTES = 11
 class DryRun(Transport):
     """Connection that keeps the last packet, sends nothing and receives nothing."""
 
-    def __init__(self, robot: DrivenRobot, wire: WireFormat) -> None:
+    def __init__(self, robot: Robot, wire: WireFormat) -> None:
         """Create a connection to nothing.
 
         Args:
@@ -59,7 +61,7 @@ class DryRun(Transport):
         return f"{count} packets would have been sent, the last: {description}"
 
 
-def describe_packet(packet: bytes, robot: DrivenRobot, wire: WireFormat) -> str:
+def describe_packet(packet: bytes, robot: Robot, wire: WireFormat) -> str:
     """Describe a command packet: its first and last bytes, and one line per leg.
 
     Angles (rad) are those of the drives: joint angle plus `joint_zeros` of the calibration, clamped
@@ -78,7 +80,7 @@ def describe_packet(packet: bytes, robot: DrivenRobot, wire: WireFormat) -> str:
         f"{len(packet)} bytes, {packet[:SHOWN_BYTES].hex()} ... CRC 0x{int.from_bytes(packet[-4:], 'little'):08X}"
     ]
     legs: dict[str, list[str]] = {}
-    for i, joint in enumerate(robot.joint_names):
+    for i, joint in enumerate(JOINT_NAMES):
         leg, _, kind = joint.removesuffix("_joint").partition("_")
         law = f"q {command.q[i]:+.3f} dq {command.dq[i]:+.2f} tau {command.tau[i]:+.2f}"
         legs.setdefault(leg, []).append(f"{kind} {law} kp {command.kp[i]:g} kd {command.kd[i]:g}")

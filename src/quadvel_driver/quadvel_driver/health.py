@@ -8,9 +8,10 @@ from enum import IntEnum
 import numpy as np
 
 from quadvel_description.arrays import Bools
+from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import Robot
 
 from .board_state import BoardState
-from .driven_robot import DrivenRobot
 from .link import SILENCE_LIMIT_S, LinkReport
 from .remote import BUTTONS, OperatorCommand
 
@@ -33,7 +34,7 @@ Status = tuple[Level, str]
 class Health:
     """Assesses one link from report to report."""
 
-    def __init__(self, board: str, robot: DrivenRobot) -> None:
+    def __init__(self, board: str, robot: Robot) -> None:
         """Create the assessment of a link.
 
         Args:
@@ -74,7 +75,7 @@ class Health:
             since = "yet" if report.silence == float("inf") else f"for {report.silence:.1f} s"
             network = report.last_error if new["network_errors"] else ""
             frozen = "its tick stands still" if new["repeated"] > new["states"] else ""
-            reason = refusal or frozen or network or self._robot.no_state_hint
+            reason = refusal or frozen or network or self._robot.drive.no_state_hint
             yield Level.ERROR, f"no state from {self._board} {since}: {reason}"
         elif refusal:
             bad = sum(new[name] for name in BAD_DATAGRAMS)
@@ -87,16 +88,19 @@ class Health:
     def _motor_problems(self, newest: BoardState | None, report: LinkReport) -> Iterator[Status]:
         if newest is None or report.silence > SILENCE_LIMIT_S:
             return
-        names, mode = self._robot.joint_names, self._robot.dropped_out_mode
+        mode = self._robot.drive.dropped_out_mode
         for i in np.flatnonzero(dropped_out(newest, self._robot)):
             error = f"mode {mode}, error {newest.motor_error[i]}"
-            yield Level.ERROR, f"{names[i]} has dropped out ({error}): stop the robot and let it cool down"
+            yield (
+                Level.ERROR,
+                f"{JOINT_NAMES[i]} has dropped out ({error}): stop the robot and let it cool down",
+            )
         hottest = int(np.argmax(newest.temperature))
         if newest.temperature[hottest] >= HOT_MOTOR_C:
-            yield Level.WARN, f"{names[hottest]} is at {newest.temperature[hottest]} deg C: let it rest"
+            yield Level.WARN, f"{JOINT_NAMES[hottest]} is at {newest.temperature[hottest]} deg C: let it rest"
 
 
-def dropped_out(state: BoardState, robot: DrivenRobot) -> Bools:
+def dropped_out(state: BoardState, robot: Robot) -> Bools:
     """Find the motors that the board has switched off.
 
     Args:
@@ -106,9 +110,9 @@ def dropped_out(state: BoardState, robot: DrivenRobot) -> Bools:
     Returns:
         Whether each has, (n,); all false if the code is not known.
     """
-    if robot.dropped_out_mode is None:
-        return np.zeros(len(robot.joint_names), bool)
-    switched_off: Bools = state.motor_mode == robot.dropped_out_mode
+    if robot.drive.dropped_out_mode is None:
+        return np.zeros(len(JOINT_NAMES), bool)
+    switched_off: Bools = state.motor_mode == robot.drive.dropped_out_mode
     return switched_off
 
 
@@ -123,7 +127,7 @@ def _operator_problems(stopped: bool) -> Iterator[Status]:
         yield Level.WARN, f"stopped by the remote; {release} release it"
 
 
-def diagnostic_values(report: LinkReport, newest: BoardState | None, robot: DrivenRobot) -> dict[str, object]:
+def diagnostic_values(report: LinkReport, newest: BoardState | None, robot: Robot) -> dict[str, object]:
     """Return all values for /diagnostics.
 
     Args:
@@ -144,7 +148,7 @@ def diagnostic_values(report: LinkReport, newest: BoardState | None, robot: Driv
         "last_error": report.last_error,
     }
     if newest is not None:
-        for i, joint in enumerate(robot.joint_names):
+        for i, joint in enumerate(JOINT_NAMES):
             values[f"{joint} temperature"] = int(newest.temperature[i])
             values[f"{joint} mode"] = int(newest.motor_mode[i])
             values[f"{joint} error"] = int(newest.motor_error[i])

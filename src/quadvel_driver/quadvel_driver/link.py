@@ -5,7 +5,7 @@ every 2 ms, so a lost packet costs 2 ms. It sends damping if commands stop, if t
 the robot, and at the end. The board itself brakes if packets stop.
 
 What depends on the robot is passed in: a `Transport` (UDP or DDS) carries packets, a `WireFormat`
-gives their bytes, a `DrivenRobot` the limits, and a `Takeover` decides whether anything may be sent.
+gives their bytes, the `Robot` has the limits, and a `Takeover` decides whether anything may be sent.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ import attrs
 import numpy as np
 
 from quadvel_description.fields import field, positive
+from quadvel_description.robot import Robot
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_nodes.messages import QUATERNION_TOLERANCE
 
 from .board_clock import BoardClock
 from .board_state import BoardState
 from .calibration import Calibration
-from .driven_robot import DrivenRobot
 from .packets import CRC, LENGTH, WireError
 from .takeover import Access, Takeover
 
@@ -160,7 +160,7 @@ class Link:
 
     def __init__(
         self,
-        robot: DrivenRobot,
+        robot: Robot,
         wire: WireFormat,
         transport: Transport,
         config: LinkConfig,
@@ -427,7 +427,7 @@ network_errors: errors of the connection.
 """
 
 
-def clamp_for_board(command: JointCommand, robot: DrivenRobot) -> JointCommand:
+def clamp_for_board(command: JointCommand, robot: Robot) -> JointCommand:
     """Clamp a command to the limits of the robot, and replace damping mode by a servo without stiffness.
 
     Boards do not define the damping of mode 0, so braking is sent as a servo with kp = 0 and the

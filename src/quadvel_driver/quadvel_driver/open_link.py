@@ -6,17 +6,16 @@ from collections.abc import Callable
 
 import attrs
 
+from quadvel_description.robot import Robot, load_robot
+
 from . import wire
-from .aliengo import ALIENGO
 from .board_state import BoardState
-from .driven_robot import DrivenRobot
 from .dry_run import DryRun
 from .link import Link, WireFormat
 from .parameters import DriverParameters
 from .udp import UdpTransport
 from .unitree_dds import wire as dds_wire
 from .unitree_dds.bus import Bus
-from .unitree_dds.go2 import GO2
 from .unitree_dds.motion_switcher import MotionSwitcher
 from .unitree_dds.takeover import DdsTakeover
 from .unitree_dds.transport import DdsTransport
@@ -28,13 +27,13 @@ class OpenLink:
 
     Attributes:
         link: The link, not yet running.
-        robot: Names and limits of the joints.
+        robot: The robot.
         board: Name of the board, for messages.
         dry_run: The connection if nothing is sent, else None.
     """
 
     link: Link
-    robot: DrivenRobot
+    robot: Robot
     board: str
     dry_run: DryRun | None
 
@@ -51,17 +50,18 @@ def open_link(settings: DriverParameters, on_state: Callable[[BoardState], None]
 
     Raises:
         LinkError: The connection cannot be opened.
+        FileNotFoundError: There is no such robot.
         CalibrationError: The calibration file cannot be used.
     """
     calibration = settings.load_calibration()
-    is_go2 = settings.robot == "go2"
-    robot = GO2 if is_go2 else ALIENGO
-    packets: WireFormat = dds_wire if is_go2 else wire
+    robot = load_robot(settings.robot)
+    uses_dds = robot.drive.board == "unitree_dds"
+    packets: WireFormat = dds_wire if uses_dds else wire
     if settings.dry_run:
         dry_run = DryRun(robot, packets)
         link = Link(robot, packets, dry_run, settings, on_state, calibration)
         return OpenLink(link, robot, dry_run.board, dry_run)
-    if not is_go2:
+    if not uses_dds:
         udp = UdpTransport(settings)
         link = Link(robot, packets, udp, settings, on_state, calibration)
         return OpenLink(link, robot, udp.board, None)

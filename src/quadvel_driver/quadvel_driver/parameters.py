@@ -5,6 +5,7 @@ from __future__ import annotations
 import attrs
 
 from quadvel_description.fields import field
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_nodes.scheduling import Scheduling
 
 from .calibration import Calibration
@@ -14,7 +15,6 @@ from .udp import UdpConfig
 from .unitree_dds.transport import DdsConfig
 
 MAX_STATE_RATE_HZ = 1000  # rate of the AlienGo's board; that of a Go2 reports at 500 Hz
-ROBOTS = ("aliengo", "go2")
 
 
 @attrs.frozen(kw_only=True)
@@ -22,13 +22,13 @@ class DriverParameters(UdpConfig, DdsConfig, RemoteConfig, Scheduling):
     """Parameters of link, remote and scheduling, and of the node itself.
 
     Attributes:
-        robot: Kind of robot, one of ROBOTS.
+        robot: Name of the robot, or path of a robot.yaml.
         state_rate: Rate of low_state, Hz.
         calibration: Calibration file of this robot; empty for none.
         dry_run: Whether to show packets instead of sending them.
     """
 
-    robot: str = field("aliengo", f"the robot: {' (UDP) or '.join(ROBOTS)} (DDS)", one_of=ROBOTS)
+    robot: str = field(DEFAULT_ROBOT, "the robot: its name, or the path of a robot.yaml")
     state_rate: int = field(
         200,
         "rate of low_state, Hz, up to 1000; the board's own is the highest",

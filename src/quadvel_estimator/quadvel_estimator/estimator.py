@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import gc
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -25,20 +24,22 @@ from quadvel_description.arrays import Array
 from quadvel_description.fields import field, positive
 from quadvel_description.frames import BASE, ODOM, FramePose, footprint
 from quadvel_description.kinematics import rotate
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot, load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.flat_messages import Stamp, decode_low_cmd, decode_low_state, encode_estimate
 from quadvel_nodes.messages import MessageError, Refusals
 from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.robot_check import RobotCheck
 from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transform_messages
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_nodes.stall_free_clock import StallFreeClock
 
 from . import features
 from .kalman import KalmanEstimator
-from .learned import SHIPPED_MODEL, LearnedEstimator
+from .learned import LearnedEstimator
 from .tracker import Estimate, Estimator, VelocityTracker
 
 KINDS = ("learned", "kalman")
@@ -55,6 +56,7 @@ class EstimatorParameters(Scheduling):
     """Parameters of the node `estimator`.
 
     Attributes:
+        robot: Name of the robot, or path of a robot.yaml.
         kind: "learned" or "kalman".
         model: ONNX file of the learned estimator; empty for the shipped one.
         reset_gap: Time without a state after which the estimator is reset, s.
@@ -63,6 +65,7 @@ class EstimatorParameters(Scheduling):
         publish_tf: Whether to publish transforms on /tf.
     """
 
+    robot: str = field(DEFAULT_ROBOT, "the robot: its name, or the path of a robot.yaml")
     kind: str = field("learned", f"how velocity is estimated: {' or '.join(KINDS)}", one_of=KINDS)
     model: str = field("", "file of the learned estimator's network, ONNX; empty: the shipped one")
     reset_gap: float = positive(0.1, "time without a state after which the estimator is reset, s")
@@ -72,8 +75,11 @@ class EstimatorParameters(Scheduling):
         True, "whether to publish the transforms of body_frame in odom_frame and of base_footprint"
     )
 
-    def make_estimator(self) -> Estimator:
+    def make_estimator(self, robot: Robot) -> Estimator:
         """Create the estimator that `kind` names.
+
+        Args:
+            robot: The robot, loaded.
 
         Returns:
             The estimator.
@@ -82,8 +88,8 @@ class EstimatorParameters(Scheduling):
             NetworkFileError: The file of the network is missing or does not fit.
         """
         if self.kind == "kalman":
-            return KalmanEstimator()
-        return LearnedEstimator(Path(self.model) if self.model else SHIPPED_MODEL)
+            return KalmanEstimator(robot)
+        return LearnedEstimator(robot, self.model or None)
 
 
 class EstimatorNode(Node):
@@ -92,7 +98,9 @@ class EstimatorNode(Node):
     def __init__(self) -> None:
         super().__init__("estimator")
         self._settings = read_parameters(self, EstimatorParameters)
-        self._tracker = VelocityTracker(self._settings.make_estimator(), self._settings.reset_gap)
+        self._robot = load_robot(self._settings.robot)
+        self._robot_check = RobotCheck(self, self._robot)
+        self._tracker = VelocityTracker(self._settings.make_estimator(self._robot), self._settings.reset_gap)
         self._robot_time = StallFreeClock()
         self._refusals = Refusals()
         self._reported = _ReportedCounts()
@@ -116,7 +124,7 @@ class EstimatorNode(Node):
     def _on_command(self, data: bytes) -> None:
         try:
             command = decode_low_cmd(data)
-            self._tracker.set_previous_action(features.previous_action(command.q, command.mode))
+            self._tracker.set_previous_action(features.previous_action(self._robot, command.q, command.mode))
         except MessageError as error:
             self._refusals.add("low_cmd", error)
 
@@ -152,7 +160,7 @@ class EstimatorNode(Node):
 
     def _publish_odometry(self, stamp: Any, state: RobotState, estimate: Estimate) -> None:
         """Publish x and y by dead reckoning and the orientation of the IMU; z is the height above the lowest foot."""
-        floor = footprint(ALIENGO, state.q, state.quaternion)
+        floor = footprint(self._robot, state.q, state.quaternion)
         position = np.array([*estimate.position[:2], -rotate(state.quaternion, floor.position)[2]])
         variances = np.array([*estimate.position_deviation[:2] ** 2, HEIGHT_VARIANCE])
         message = Odometry(child_frame_id=self._settings.body_frame)
@@ -184,6 +192,7 @@ class EstimatorNode(Node):
         else:
             level, summary = DiagnosticStatus.OK, "estimating"
         values = {
+            "robot": self._settings.robot,
             "kind": self._settings.kind,
             "rate_hz": count,
             "compute_mean_us": f"{1e6 * busy / count:.0f}" if count else "",

@@ -25,7 +25,7 @@ from quadvel_description.arrays import Array
 from quadvel_description.fields import field, positive
 from quadvel_description.kinematics import foot_kinematics, rotation_matrix
 from quadvel_description.quadruped import GRAVITY
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot
 from quadvel_description.state import RobotState
 
 from .odometry import foot_velocity_in_trunk, rolling_velocity
@@ -102,13 +102,15 @@ class KalmanEstimator:
         config: Noise and thresholds.
     """
 
-    def __init__(self, config: KalmanConfig | None = None, shape: tuple[int, ...] = ()) -> None:
+    def __init__(self, robot: Robot, config: KalmanConfig | None = None, shape: tuple[int, ...] = ()) -> None:
         """Create a filter.
 
         Args:
+            robot: The robot.
             config: Noise and thresholds; None for the defaults.
             shape: Leading axes of all arrays; () for one robot.
         """
+        self._robot = robot
         self.config = config or KalmanConfig()
         self._state = np.zeros((*shape, 5, 3))
         self._covariance = np.zeros((*shape, 5, 5))
@@ -174,10 +176,10 @@ class KalmanEstimator:
         contact of each foot (..., 4), and the trunk's acceleration (..., 3).
         """
         rotation = rotation_matrix(state.quaternion)
-        feet, jacobians = foot_kinematics(ALIENGO, state.q)
+        feet, jacobians = foot_kinematics(self._robot, state.q)
         to_world = rotation.swapaxes(-1, -2)  # R^T, as vectors are rows: s_world = s_body R^T
         # With the foot s_i relative to the trunk, v = v_roll,i - d/dt (R s_i) for a planted foot.
-        rolling = rolling_velocity(state, rotation) @ to_world
+        rolling = rolling_velocity(self._robot, state, rotation) @ to_world
         leg_velocity = rolling - foot_velocity_in_trunk(state, feet, jacobians) @ to_world
         trust = self._contact_trust(state, rotation, jacobians)
         acceleration = (rotation @ np.asarray(state.linear_acceleration)[..., None])[..., 0]

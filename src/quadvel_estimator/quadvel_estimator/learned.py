@@ -11,34 +11,53 @@ from quadvel_description.arrays import Array
 from quadvel_description.network_file import NetworkFileError
 from quadvel_description.network_input import InputLayout
 from quadvel_description.recurrent_network import RecurrentNetwork
-from quadvel_description.robot import NOMINAL_Q
-from quadvel_description.robot_name import UNNAMED_ROBOT
+from quadvel_description.robot import Robot
+from quadvel_description.robot_name import shipped_file
 from quadvel_description.state import RobotState
 
 from . import features
 
 _DIAGONAL = np.arange(3), np.arange(3)
-SHIPPED_MODEL = Path(__file__).parent / "models" / "estimator.onnx"
+_MODELS = Path(__file__).parent / "models"
+SHIPPED_MODEL = _MODELS / "estimator.onnx"
+
+
+def shipped_estimator(robot: Robot) -> Path:
+    """Find the shipped estimator of a robot.
+
+    Args:
+        robot: The robot.
+
+    Returns:
+        Its ONNX file.
+
+    Raises:
+        FileNotFoundError: None is shipped for this robot.
+    """
+    return shipped_file(_MODELS, robot.name, SHIPPED_MODEL.name)
 
 
 class LearnedEstimator:
     """Runs a velocity network on samples at the rate of its training, `features.RATE_HZ`."""
 
-    def __init__(self, path: str | Path = SHIPPED_MODEL) -> None:
+    def __init__(self, robot: Robot, path: str | Path | None = None) -> None:
         """Load a network and check its metadata.
 
         Args:
-            path: The ONNX file.
+            robot: The robot.
+            path: The ONNX file; None for the shipped one.
 
         Raises:
             NetworkFileError: The file is missing or is not a velocity estimator for this robot and
                 rate.
         """
-        self._network = RecurrentNetwork(path, UNNAMED_ROBOT, features.OUTPUTS, features.METADATA_FIELDS)
+        path = shipped_estimator(robot) if path is None else path
+        self._robot = robot
+        self._network = RecurrentNetwork(path, robot.name, features.OUTPUTS, features.METADATA_FIELDS)
         metadata = self._network.metadata
         self._expect("metadata field kind", metadata["kind"], features.KIND)
         self._expect("metadata field rate_hz", metadata["rate_hz"], features.RATE_HZ)
-        self._expect("metadata field nominal_q", metadata["nominal_q"], NOMINAL_Q.tolist())
+        self._expect("metadata field nominal_q", metadata["nominal_q"], robot.nominal_q.tolist())
         try:
             self._layout = InputLayout.from_metadata(metadata["inputs"], features.KNOWN_INPUTS)
         except ValueError as error:
@@ -69,7 +88,9 @@ class LearnedEstimator:
         Raises:
             FloatingPointError: The result is not finite; call `reset` before the next sample.
         """
-        velocity, log_variance = self._network.step(features.build(state, previous_action, self._layout))
+        velocity, log_variance = self._network.step(
+            features.build(self._robot, state, previous_action, self._layout)
+        )
         covariance = np.zeros((3, 3))
         covariance[_DIAGONAL] = self._scale**2 * np.exp(log_variance, dtype=np.float64)
         return np.multiply(velocity, self._scale, dtype=np.float64), covariance

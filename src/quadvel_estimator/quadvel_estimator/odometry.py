@@ -10,31 +10,32 @@ import numpy as np
 
 from quadvel_description.arrays import Array
 from quadvel_description.kinematics import foot_kinematics
-from quadvel_description.robot import ALIENGO, FOOT_RADIUS
+from quadvel_description.robot import Robot
 from quadvel_description.state import RobotState
 
 # (a @ CROSS).reshape(3, 3) is the matrix by which a row vector b becomes a x b.
 CROSS_PRODUCT_TENSOR = np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)
 
 
-def leg_velocity(state: RobotState, rotation: Array) -> Array:
+def leg_velocity(robot: Robot, state: RobotState, rotation: Array) -> Array:
     """Compute the velocity of the trunk's origin from each leg, as if its foot were planted.
 
         v = v_roll - (w x s + J dq)
 
     Args:
+        robot: The robot.
         state: The measured state, arrays (..., 12), (..., 4), (..., 3).
         rotation: Rotation matrix from body to world, (..., 3, 3).
 
     Returns:
         Velocity in the body frame, (..., 4, 3), m/s.
     """
-    return rolling_velocity(state, rotation) - foot_velocity_in_trunk(
-        state, *foot_kinematics(ALIENGO, state.q)
+    return rolling_velocity(robot, state, rotation) - foot_velocity_in_trunk(
+        state, *foot_kinematics(robot, state.q)
     )
 
 
-def rolling_velocity(state: RobotState, rotation: Array) -> Array:
+def rolling_velocity(robot: Robot, state: RobotState, rotation: Array) -> Array:
     """Compute the velocity of the centre of each foot that rolls on level ground without slip.
 
         v_roll = w_calf x (r e_up)
@@ -42,6 +43,7 @@ def rolling_velocity(state: RobotState, rotation: Array) -> Array:
     In a brisk walk, this is about 6 % of the trunk's velocity.
 
     Args:
+        robot: The robot.
         state: The measured state.
         rotation: Rotation matrix from body to world, (..., 3, 3).
 
@@ -56,7 +58,7 @@ def rolling_velocity(state: RobotState, rotation: Array) -> Array:
     calf = np.empty(dq.shape)
     calf[..., 0], calf[..., 1], calf[..., 2] = dq[..., 0], knee * np.cos(hip), knee * np.sin(hip)
     calf += np.asarray(state.angular_velocity)[..., None, :]
-    velocity: Array = -calf @ _cross_matrix(FOOT_RADIUS * rotation[..., 2, :])
+    velocity: Array = -calf @ _cross_matrix(robot.foot_radius * rotation[..., 2, :])
     return velocity
 
 

@@ -24,7 +24,7 @@ from rich.table import Table
 from typing_extensions import override
 
 from quadvel_description.onnx_format import float_value, message, serialise
-from quadvel_description.robot import ALIENGO, NOMINAL_Q
+from quadvel_description.robot import ALIENGO, NOMINAL_Q, Robot
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
 from quadvel_driver.board_state import BoardState
@@ -160,7 +160,7 @@ def bench_policy() -> dict[str, Any]:
     Returns:
         Medians and a 99th percentile, us.
     """
-    network = PolicyFile()
+    network = PolicyFile(ALIENGO)
     observation = np.zeros(network.metadata.observation.size, np.float32)
     idle = _idle_network()
 
@@ -203,7 +203,7 @@ def bench_estimator() -> dict[str, Any]:
     Returns:
         Median and 99th percentile, us.
     """
-    network, state = LearnedEstimator(), make_simulator(Setup(), seed=0).state()
+    network, state = LearnedEstimator(ALIENGO), make_simulator(Setup(), seed=0).state()
     previous_action = np.zeros(12)
     return _percentiles(_time_calls(lambda: network.update(state, previous_action), 5000))
 
@@ -232,8 +232,8 @@ def bench_packets() -> dict[str, Any]:
 class _TimedSupervisor(Supervisor):
     """Supervisor that records the duration of each tick."""
 
-    def __init__(self, policy: PolicyFile) -> None:
-        super().__init__(policy)
+    def __init__(self, robot: Robot, policy: PolicyFile) -> None:
+        super().__init__(robot, policy)
         self.seconds: list[float] = []
 
     @override
@@ -251,7 +251,7 @@ def bench_supervisor() -> dict[str, Any]:
     Returns:
         Median and 99th percentile, us.
     """
-    robot, timed = make_simulator(Setup(), seed=0), _TimedSupervisor(PolicyFile())
+    robot, timed = make_simulator(Setup(), seed=0), _TimedSupervisor(ALIENGO, PolicyFile(ALIENGO))
     walking = RobotLoop(robot, timed, TrueVelocity(robot))
     walking.start_walking()
     timed.seconds.clear()

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from quadvel_actuator import ActuatorParameters
+from quadvel_description.robot import ALIENGO
 from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 from quadvel_recordings.output import output_file, output_folder
@@ -70,8 +71,8 @@ def eval_command(
         randomised=randomised,
         actuator=actuator,
     )
-    PolicyFile(policy)  # fail on a bad file here, once, before any run
-    LearnedEstimator(estimator_file)
+    PolicyFile(ALIENGO, policy)  # fail on a bad file here, once, before any run
+    LearnedEstimator(ALIENGO, estimator_file)
     if actuator is not None:
         ActuatorParameters.load(actuator)
     folder = output_folder(out)

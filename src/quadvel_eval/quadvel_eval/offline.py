@@ -108,7 +108,7 @@ def run_estimator(path: Path, estimator: Estimator, use_receipt_times: bool = Fa
     topics = ("/low_state", "/low_cmd")
     for topic, receipt, message in read_messages(path, lambda topic, _: topic in topics, lambda _: None):
         if topic == "/low_cmd":
-            tracker.set_previous_action(previous_action(np.asarray(message.q, float), message.mode))
+            tracker.set_previous_action(previous_action(ALIENGO, np.asarray(message.q, float), message.mode))
             continue
         try:
             state = read_low_state(message)
@@ -239,7 +239,7 @@ def replay_command(
     To see a recording in 3-D: quadvel view walk.mcap
     """
     model = ActuatorParameters.of(ALIENGO) if actuator is None else ActuatorParameters.load(actuator)
-    asked = LearnedEstimator(estimator_file) if estimator == "learned" else KalmanEstimator()
+    asked = LearnedEstimator(ALIENGO, estimator_file) if estimator == "learned" else KalmanEstimator(ALIENGO)
     output_folder(out)
     run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording))
     if run.foreign_log is None:

@@ -21,7 +21,7 @@ from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import ALIENGO
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand
 from quadvel_nodes.messages import seconds
-from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_recordings.joint_log import JointLog, Series, require_commands
 from quadvel_recordings.reading import read_messages
@@ -377,7 +377,7 @@ def predicted_tracking(
     setup = Setup()
     simulator = Simulator(SimulatorConfig(robot=ALIENGO, actuator=actuator, seed=seed))
     simulator.reset("stand")
-    supervisor = Supervisor(PolicyFile(SHIPPED_POLICY))
+    supervisor = Supervisor(ALIENGO, PolicyFile(ALIENGO))
     loop = RobotLoop(simulator, supervisor, make_estimator(setup.estimator, simulator, setup.estimator_file))
     loop.start_walking()
     segments = []

@@ -120,7 +120,7 @@ def make_loop(setup: Setup, seed: int, shadow_estimators: Sequence[str] = ("lear
     simulator = make_simulator(setup, seed)
     loop = RobotLoop(
         simulator,
-        Supervisor(PolicyFile(setup.policy), backup=KalmanEstimator()),
+        Supervisor(ALIENGO, PolicyFile(ALIENGO, setup.policy), backup=KalmanEstimator(ALIENGO)),
         make_estimator(setup.estimator, simulator, setup.estimator_file),
         shadow_estimators={
             name: make_estimator(name, simulator, setup.estimator_file) for name in shadow_estimators

@@ -138,6 +138,7 @@ def _start(make_node: Callable[[], Node], args: list[str] | None) -> Node:
         return node
     except (
         ValueError,
+        OSError,
         RuntimeError,
     ) as error:  # from quadvel, or from rclpy for malformed arguments and files
         print(" ".join(str(error).split()), file=sys.stderr)

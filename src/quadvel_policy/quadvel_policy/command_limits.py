@@ -14,9 +14,11 @@ import numpy as np
 from quadvel_description.arrays import Array
 from quadvel_description.command_range import clip_to_command_range, split_target
 from quadvel_description.fields import positive
-from quadvel_description.robot import ALIENGO, TORQUE_LIMIT, VELOCITY_LIMIT
+from quadvel_description.robot import Robot
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 
+MAX_TORQUE_NM, MAX_POWER_W = 1000.0, 1e5
+"""More than the drives of such robots can do; `SupervisorConfig.check` compares with those of a robot."""
 LIMITS = {
     "target_out_of_range": "A target lies beyond the command range: it is clamped, and the rest is sent as torque.",
     "torque_jumps": "The commanded torque changes by more than `max_torque_step` in one tick.",
@@ -32,14 +34,10 @@ class JointCommandLimits:
     """Limits on joint commands besides those of the robot; each field is a node parameter."""
 
     max_torque_step: float = positive(
-        30.0,
-        "largest change of a joint's torque from tick to tick, N m",
-        at_most=2.0 * float(TORQUE_LIMIT.max()),  # from one torque limit to the other
+        30.0, "largest change of a joint's torque from tick to tick, N m", at_most=2.0 * MAX_TORQUE_NM
     )
     max_power: float = positive(
-        1800.0,
-        "largest mechanical power of all joints together, W",
-        at_most=float(TORQUE_LIMIT @ VELOCITY_LIMIT),  # of all drives at their limits
+        1800.0, "largest mechanical power of all joints together, W", at_most=MAX_POWER_W
     )
 
 
@@ -50,8 +48,10 @@ class JointCommandLimiter:
         counts: Number of ticks in which each of LIMITS acted, since the start.
     """
 
-    def __init__(self, config: JointCommandLimits) -> None:
+    def __init__(self, robot: Robot, config: JointCommandLimits) -> None:
         self._config = config
+        self._robot = robot
+        self._torque_limit, self._velocity_limit = robot.torque_limit, robot.velocity_limit
         self.counts: Counter[str] = Counter()
 
     def apply(self, command: JointCommand, before: Array, state: RobotState) -> None:
@@ -65,7 +65,7 @@ class JointCommandLimiter:
         if command.mode == MODE_DAMPING:
             return
         target = command.q
-        command.q, torque = split_target(ALIENGO, target, command.kp, state.q)
+        command.q, torque = split_target(self._robot, target, command.kp, state.q)
         command.tau = command.tau + torque
         self._count("target_out_of_range", np.count_nonzero(command.q != target) > 0)
         requested = command.torque(state.q, state.dq)
@@ -74,7 +74,7 @@ class JointCommandLimiter:
         allowed = self._limit_at_top_speed(allowed, state.dq)
         allowed = self._limit_power(allowed, state.dq)
         if np.count_nonzero(allowed != requested):
-            _add_torque(command, allowed - requested)
+            _add_torque(self._robot, command, allowed - requested)
 
     def _count(self, name: str, acts: bool | np.bool_) -> None:
         if acts:
@@ -87,12 +87,13 @@ class JointCommandLimiter:
         return held_torque
 
     def _limit_torque(self, torque: Array) -> Array:
-        held_torque: Array = np.minimum(np.maximum(torque, -TORQUE_LIMIT), TORQUE_LIMIT)
+        limit = self._torque_limit
+        held_torque: Array = np.minimum(np.maximum(torque, -limit), limit)
         self._count("torque_too_large", np.count_nonzero(held_torque != torque) > 0)
         return held_torque
 
     def _limit_at_top_speed(self, torque: Array, speed: Array) -> Array:
-        at_limit = np.abs(speed) >= VELOCITY_LIMIT
+        at_limit = np.abs(speed) >= self._velocity_limit
         if not np.count_nonzero(at_limit) or not np.count_nonzero(
             faster := at_limit & (torque * speed > 0.0)
         ):
@@ -109,7 +110,7 @@ class JointCommandLimiter:
         return np.where(power > 0.0, torque * limit / total, torque)
 
 
-def _add_torque(command: JointCommand, change: Array) -> None:
+def _add_torque(robot: Robot, command: JointCommand, change: Array) -> None:
     """Change the torque of a command by `change` (12,) N m.
 
         q_des' = clamp(q_des + change / kp),   tau_ff' = tau_ff + change - kp (q_des' - q_des)
@@ -117,6 +118,6 @@ def _add_torque(command: JointCommand, change: Array) -> None:
     The target changes as far as stiffness and range allow; feed-forward torque gives the rest.
     """
     shift = np.divide(change, command.kp, out=np.zeros(12), where=command.kp > 0.0)
-    q = np.where(shift == 0.0, command.q, clip_to_command_range(ALIENGO, command.q + shift))
+    q = np.where(shift == 0.0, command.q, clip_to_command_range(robot, command.q + shift))
     command.tau = command.tau + change - command.kp * (q - command.q)
     command.q = q

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import attrs
 
-from quadvel_description.fields import field, positive
+from quadvel_description.fields import field, positive, refusal
+from quadvel_description.robot import Robot
 
 from .command_limits import JointCommandLimits
 from .guard import FALL_TIME_S, GuardConfig
@@ -45,3 +46,24 @@ class SupervisorConfig:
     brake_time: float = positive(
         0.6, "in which the policy brings the robot to a stand after a fault, s", at_most=FALL_TIME_S
     )
+
+    def check(self, robot: Robot) -> None:
+        """Check the limits against what the drives of a robot can do.
+
+        Args:
+            robot: The robot.
+
+        Raises:
+            ValueError: A limit is larger, so that it would limit nothing.
+        """
+        torque = float(robot.torque_limit.max())
+        power = float(robot.torque_limit @ robot.velocity_limit)  # of all drives at their limits
+        for record, name, most in (
+            (self.joint_limits, "max_torque_step", 2.0 * torque),  # from one torque limit to the other
+            (self.joint_limits, "max_power", power),
+            (self.guards, "max_torque_error", torque),
+        ):
+            if (found := getattr(record, name)) > most:
+                raise refusal(
+                    record, name, found, f"at most {most:g}, what the drives of {robot.title} can do"
+                )

@@ -19,6 +19,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool
 
 from quadvel_description.fields import field
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.state import JointCommand
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand, Waiting
@@ -28,6 +30,7 @@ from quadvel_nodes.flat_messages import decode_estimate, decode_low_state, encod
 from quadvel_nodes.messages import MessageError, Refusals, read_numbers, seconds
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.number_text import number_text
+from quadvel_nodes.robot_check import RobotCheck
 from quadvel_nodes.scheduling import Scheduling
 
 from .control_loop import WATCH_PERIOD_S, ControlConfig, ControlLoop
@@ -53,6 +56,7 @@ class ControllerParameters:
 
     scheduling: Scheduling = Scheduling()
     control: ControlConfig = ControlConfig()
+    robot: str = field(DEFAULT_ROBOT, "the robot: its name, or the path of a robot.yaml")
     policy: str = field("", "ONNX file of the policy; empty: the one that is shipped")
 
 
@@ -62,9 +66,13 @@ class Controller(Node):
     def __init__(self) -> None:
         super().__init__("controller")
         self._settings = read_parameters(self, ControllerParameters)
-        policy = PolicyFile(self._settings.policy or SHIPPED_POLICY)
+        robot = load_robot(self._settings.robot)
+        self._robot_check = RobotCheck(self, robot)
+        policy = PolicyFile(robot, self._settings.policy or None)
         policy.prepare()  # the first run is slow
-        self._supervisor = Supervisor(policy, self._settings.control.supervisor, KalmanEstimator())
+        self._supervisor = Supervisor(
+            robot, policy, self._settings.control.supervisor, KalmanEstimator(robot)
+        )
         self._sim_time: bool = self.get_parameter("use_sim_time").value
         self._loop = ControlLoop(
             self._supervisor,
@@ -211,6 +219,7 @@ class Controller(Node):
         values = {
             "mode": self._supervisor.mode,
             "reason": self._supervisor.reason,
+            "robot": self._settings.robot,
             "policy": self._settings.policy or f"the shipped one ({SHIPPED_POLICY.name})",
             **{name: number_text(value, ".4g") for name, value in attrs.asdict(self._loop_summary).items()},
             "pauses": self._loop.stall_detector.count,

@@ -16,10 +16,11 @@ import numpy as np
 
 from quadvel_description.arrays import Array
 from quadvel_description.fields import field, positive
-from quadvel_description.robot import LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
+from quadvel_description.robot import Robot
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_nodes.messages import MessageError
 
+from .command_limits import MAX_TORQUE_NM
 from .tick_input import MotorStatus
 
 MOVING_MODES = ("stand_up", "stance", "walk", "lie_down")
@@ -43,6 +44,21 @@ class Level(IntEnum):
     LIMIT = 1
     STANCE = 2
     DAMPING = 3
+
+
+@attrs.frozen(eq=False)
+class JointBounds:
+    """Measured joint positions and speeds that guards accept.
+
+    Attributes:
+        lower: Smallest angles, (12,), rad.
+        upper: Largest angles, (12,), rad.
+        speed: Largest speeds, (12,), rad/s.
+    """
+
+    lower: Array
+    upper: Array
+    speed: Array
 
 
 @attrs.frozen(kw_only=True)
@@ -81,7 +97,7 @@ class GuardConfig:
     max_torque_error: float = positive(
         12.0,
         "largest deviation of a drive's torque from the commanded one, mean over 0.1 s, N m",
-        at_most=float(TORQUE_LIMIT.max()),
+        at_most=MAX_TORQUE_NM,
     )
     max_acceleration_error: float = positive(
         5.0, "largest mean acceleration of the trunk over 0.5 s, without gravity, m/s^2", at_most=50.0
@@ -115,15 +131,20 @@ class GuardConfig:
         """Longest time without a state, and largest age of the state, s; longer if the robot's time may stand still."""
         return self.max_standstill if self.robot_waits else self.max_state_age
 
-    @cached_property
-    def joint_range(self) -> tuple[Array, Array]:
-        """Smallest and largest accepted angle of each joint, (12,), rad."""
-        return LOWER - self.joint_margin, UPPER + self.joint_margin
+    def joint_bounds(self, robot: Robot) -> JointBounds:
+        """Compute the accepted joint positions and speeds of a robot.
 
-    @cached_property
-    def joint_speeds(self) -> Array:
-        """Largest accepted speed of each joint, (12,), rad/s."""
-        return self.max_joint_speed * VELOCITY_LIMIT
+        Args:
+            robot: The robot.
+
+        Returns:
+            The bounds.
+        """
+        return JointBounds(
+            lower=robot.lower - self.joint_margin,
+            upper=robot.upper + self.joint_margin,
+            speed=self.max_joint_speed * robot.velocity_limit,
+        )
 
 
 @attrs.define
@@ -131,6 +152,8 @@ class GuardInput:
     """Input of the guards at one tick: the outer inputs (`TickInput`) and what the supervisor knows.
 
     Attributes:
+        robot: The robot.
+        bounds: Accepted joint positions and speeds.
         config: Limits.
         mode: Present mode of the supervisor.
         state: State of this tick.
@@ -149,6 +172,8 @@ class GuardInput:
         stopped: Time that the controller did not run between the two states, s.
     """
 
+    robot: Robot
+    bounds: JointBounds
     config: GuardConfig
     mode: str
     state: RobotState
@@ -168,10 +193,10 @@ class GuardInput:
     @cached_property
     def is_sound(self) -> bool:
         """Whether all numbers are finite and all joints within their limits; one check for the usual case."""
-        state, (low, high) = self.state, self.config.joint_range
+        state, bounds = self.state, self.bounds
         return bool(
-            np.count_nonzero((state.q >= low) & (state.q <= high)) == 12
-            and np.count_nonzero(np.abs(state.dq) <= self.config.joint_speeds) == 12
+            np.count_nonzero((state.q >= bounds.lower) & (state.q <= bounds.upper)) == 12
+            and np.count_nonzero(np.abs(state.dq) <= bounds.speed) == 12
             and all(map(math.isfinite, (*state.quaternion.tolist(), *state.angular_velocity.tolist())))
         )
 

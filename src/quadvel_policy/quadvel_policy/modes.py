@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from quadvel_description.arrays import Array
 from quadvel_description.kinematics import foot_positions, inverse_kinematics, rotate_inverse
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot
 from quadvel_description.state import JointCommand, RobotState
 
 from .observation import JOINTS, PolicyMetadata, build_observation
@@ -174,19 +174,21 @@ class Posture:
     is at most kp times the speed of the path.
     """
 
-    def __init__(self, path: Sequence[tuple[float, Array]], kp: float, kd: float) -> None:
+    def __init__(self, robot: Robot, path: Sequence[tuple[float, Array]], kp: float, kd: float) -> None:
         """Create the mode.
 
         Args:
+            robot: The robot.
             path: Duration (s) and joint angles (12,) rad of each posture, on level ground.
             kp: Stiffness of each joint, N m/rad.
             kd: Damping of each joint, N m s/rad.
         """
+        self._robot = robot
         self._times = np.cumsum([0.0, *(seconds for seconds, _ in path)])
         self._postures = np.array([np.zeros(JOINTS), *(q for _, q in path)])
-        self._feet = foot_positions(ALIENGO, self._postures[1:])
+        self._feet = foot_positions(robot, self._postures[1:])
         # Difference to the inverse kinematics, not zero if a knee bends the other way.
-        self._offset = self._postures[1:] - inverse_kinematics(ALIENGO, self._feet)
+        self._offset = self._postures[1:] - inverse_kinematics(robot, self._feet)
         self._kp, self._kd = np.full(JOINTS, kp), np.full(JOINTS, kd)
         self._lean, self._lean_updated_at = np.zeros(2), 0.0
 
@@ -250,7 +252,7 @@ class Posture:
         """Return the postures of the path, (n, 12), rad, for an offset of the vertical (`vertical_offset`)."""
         feet = self._feet.copy()
         feet[..., :2] -= feet[..., 2:].mean(axis=1, keepdims=True) * lean
-        leaning: Array = inverse_kinematics(ALIENGO, feet) + self._offset
+        leaning: Array = inverse_kinematics(self._robot, feet) + self._offset
         return leaning
 
     def _interpolate(self, elapsed: float) -> tuple[Array, Array]:

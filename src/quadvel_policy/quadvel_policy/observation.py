@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping
+from functools import cache
 from typing import Any
 
 import attrs
@@ -21,7 +22,7 @@ from quadvel_description.network_input import InputLayout as ObservationSpec
 from quadvel_description.network_input import InputTerm as ObservationTerm
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.recurrent_network import SCHEMA
-from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.robot import Robot
 from quadvel_description.robot_name import UNNAMED_ROBOT
 
 RATE_HZ = 200.0
@@ -37,21 +38,34 @@ OBSERVATION_SIZES = {
     "previous_action": JOINTS,  # raw network output of the previous tick
 }
 
-DEFAULT_OBSERVATION = ObservationSpec(
-    (
-        ObservationTerm("command", 4),
-        ObservationTerm("roll_pitch", 2, scale=2.0, clip=10.0),
-        ObservationTerm("q", JOINTS, offset=tuple(NOMINAL_Q), scale=2.0, clip=10.0),
-        ObservationTerm("dq", JOINTS, scale=0.1, clip=10.0),
-        ObservationTerm("linear_velocity", 3, clip=10.0),
-        ObservationTerm("angular_velocity", 3, scale=0.5, clip=10.0),
-        ObservationTerm("previous_action", JOINTS, clip=10.0),
-    )
-)
-"""The 48 numbers of the paper's Section 4.1, each with a magnitude of about 1 in a walk."""
+OBSERVATION_SIZE = sum(OBSERVATION_SIZES.values())
+"""Length of the observation of the paper's Section 4.1, 48."""
 
 Vector = tuple[float, ...]
 Bounds = tuple[float, float]
+
+
+@cache
+def default_observation(robot: Robot) -> ObservationSpec:
+    """Create the observation of the paper's Section 4.1, each number with a magnitude of about 1 in a walk.
+
+    Args:
+        robot: The robot, whose nominal posture is the offset of the joint positions.
+
+    Returns:
+        The terms, OBSERVATION_SIZE numbers.
+    """
+    return ObservationSpec(
+        (
+            ObservationTerm("command", 4),
+            ObservationTerm("roll_pitch", 2, scale=2.0, clip=10.0),
+            ObservationTerm("q", JOINTS, offset=tuple(robot.nominal_q), scale=2.0, clip=10.0),
+            ObservationTerm("dq", JOINTS, scale=0.1, clip=10.0),
+            ObservationTerm("linear_velocity", 3, clip=10.0),
+            ObservationTerm("angular_velocity", 3, scale=0.5, clip=10.0),
+            ObservationTerm("previous_action", JOINTS, clip=10.0),
+        )
+    )
 
 
 def build_observation(
@@ -274,14 +288,14 @@ class PolicyMetadata:
     schema: int = SCHEMA
     robot: str
     joint_names: tuple[str, ...] = JOINT_NAMES
-    nominal_q: Vector = tuple(NOMINAL_Q)
+    nominal_q: Vector
     action_offset: Vector
     action_scale: Vector
     action_clip: Bounds | None = None
     kp: Vector
     kd: Vector
     rate_hz: float = RATE_HZ
-    observation: ObservationSpec = DEFAULT_OBSERVATION
+    observation: ObservationSpec
     command_limits: dict[str, Bounds]
     curve_limit: float | None = None
     state_shape: tuple[int, ...]

@@ -12,11 +12,28 @@ from numpy.typing import NDArray
 
 from quadvel_description.network_file import NetworkFileError
 from quadvel_description.recurrent_network import RecurrentNetwork
-from quadvel_description.robot_name import UNNAMED_ROBOT
+from quadvel_description.robot import Robot
+from quadvel_description.robot_name import shipped_file
 
 from .observation import JOINTS, RATE_HZ, REQUIRED_FIELDS, MetadataError, PolicyMetadata
 
-SHIPPED_POLICY = Path(__file__).parent / "policies" / "crl_eam.onnx"
+_POLICIES = Path(__file__).parent / "policies"
+SHIPPED_POLICY = _POLICIES / "crl_eam.onnx"
+
+
+def shipped_policy(robot: Robot) -> Path:
+    """Find the shipped policy of a robot.
+
+    Args:
+        robot: The robot.
+
+    Returns:
+        Its ONNX file.
+
+    Raises:
+        FileNotFoundError: None is shipped for this robot.
+    """
+    return shipped_file(_POLICIES, robot.name, SHIPPED_POLICY.name)
 
 
 class PolicyFile:
@@ -26,17 +43,19 @@ class PolicyFile:
         metadata: The validated metadata.
     """
 
-    def __init__(self, path: str | Path = SHIPPED_POLICY) -> None:
+    def __init__(self, robot: Robot, path: str | Path | None = None) -> None:
         """Load and validate a policy file.
 
         Args:
-            path: The ONNX file.
+            robot: The robot that the policy has to belong to.
+            path: The ONNX file; None for the shipped one.
 
         Raises:
             NetworkFileError: The file is missing or is not a policy for this robot and rate; one
                 sentence with the name of the file.
         """
-        network = RecurrentNetwork(path, UNNAMED_ROBOT, {"actions": JOINTS}, REQUIRED_FIELDS)
+        path = shipped_policy(robot) if path is None else path
+        network = RecurrentNetwork(path, robot.name, {"actions": JOINTS}, REQUIRED_FIELDS)
         try:
             self.metadata = PolicyMetadata.from_fields(network.metadata)
         except MetadataError as error:

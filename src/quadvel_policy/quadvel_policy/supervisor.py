@@ -13,7 +13,7 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Array
-from quadvel_description.robot import LIE_Q
+from quadvel_description.robot import Robot
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_nodes.messages import NotFiniteError
 
@@ -91,6 +91,7 @@ class Supervisor:
 
     def __init__(
         self,
+        robot: Robot,
         policy: Policy,
         config: SupervisorConfig | None = None,
         backup: Estimator | None = None,
@@ -99,20 +100,26 @@ class Supervisor:
         """Create a supervisor in passive mode.
 
         Args:
+            robot: The robot.
             policy: The policy that walks.
             config: Gains, durations and limits; None for the defaults.
             backup: Filter that replaces a missing or wrong velocity estimate; None for none.
             guards: Guard classes, in priority order.
+
+        Raises:
+            ValueError: A limit exceeds what the robot's drives can do.
         """
         self._config = c = config or SupervisorConfig()
+        c.check(robot)
+        self._robot, self._bounds = robot, c.guards.joint_bounds(robot)
         self._command_limits = policy.metadata.limits
         nominal = np.array(policy.metadata.nominal_q)
         paths = {
-            "stand_up": [(c.fold_time, LIE_Q), (c.rise_time, nominal)],
+            "stand_up": [(c.fold_time, robot.lie_q), (c.rise_time, nominal)],
             "stance": [(c.settle_time, nominal)],
-            "lie_down": [(c.lie_down_time, LIE_Q)],
+            "lie_down": [(c.lie_down_time, robot.lie_q)],
         }
-        self._postures = {mode: Posture(path, c.stand_kp, c.stand_kd) for mode, path in paths.items()}
+        self._postures = {mode: Posture(robot, path, c.stand_kp, c.stand_kd) for mode, path in paths.items()}
         self._walk, damping = Walk(policy, c.blend_time), Damping(c.damping_kd)
         self._modes: dict[str, Mode] = {
             **self._postures, "passive": damping, "walk": self._walk, "fault": damping
@@ -120,7 +127,7 @@ class Supervisor:
         self._situation = Situation(c, self._postures["stance"], c.auto_stand)
         self._guards, self._backup = GuardSet(guards), BackupVelocity(backup)
         self._deferred_input: GuardInput | None = None  # of the last tick, until the deferred guards have run
-        self._limiter = JointCommandLimiter(c.joint_limits)
+        self._limiter = JointCommandLimiter(robot, c.joint_limits)
         self.limits = self._limiter.counts
         self.fault = ""
         self.findings: list[Finding] = []
@@ -254,6 +261,8 @@ class Supervisor:
         velocity = None if inputs.velocity is None else np.asarray(inputs.velocity, float)
         self._backup.confirm(velocity, CONFIRMED_SHARE * self._config.guards.max_velocity_error)
         guard_input = GuardInput(
+            robot=self._robot,
+            bounds=self._bounds,
             config=self._config.guards,
             mode=now.mode,
             state=state,

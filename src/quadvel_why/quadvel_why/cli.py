@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from quadvel_description.robot import ALIENGO
+from quadvel_policy.policy_file import PolicyFile
 from quadvel_recordings.output import atomic_write, output_folder
 
 from .diagnosis import diagnose
@@ -68,10 +69,10 @@ def why_command(
       2  a wrong argument or file
     """
     output_folder(out)
-    driver = PolicyFile(policy) if policy is not None else None
+    driver = PolicyFile(ALIENGO, policy) if policy is not None else None
     run = read_run(recording, gains)
     if driver is None and run.is_own:
-        driver = PolicyFile(SHIPPED_POLICY)
+        driver = PolicyFile(ALIENGO)
     for remark in run.remarks:
         typer.echo(f"quadvel: warning: {recording}: {remark}", err=True)
     diagnosis = diagnose(Signals(run, driver))

@@ -108,7 +108,7 @@ class Legs:
             run.imu.linear_acceleration,
             np.zeros(4),
         )
-        return self._to_world(leg_velocity(state, self.rotation))
+        return self._to_world(leg_velocity(ALIENGO, state, self.rotation))
 
     @cached_property
     def height(self) -> Array:

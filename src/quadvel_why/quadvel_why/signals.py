@@ -14,7 +14,7 @@ from quadvel_description.arrays import Array, Bools
 from quadvel_description.robot import ALIENGO
 from quadvel_description.state import RobotState
 from quadvel_estimator.features import previous_action
-from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
+from quadvel_estimator.learned import LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
 
 from .imu import ImuHypotheses
@@ -184,7 +184,7 @@ class Signals:
         run, commands = self.run, self.run.commands
         assert run.imu is not None
         assert run.tau is not None
-        estimator = LearnedEstimator(SHIPPED_MODEL)
+        estimator = LearnedEstimator(ALIENGO)
         found = np.full((len(run.time), 3), np.nan)
         # The action in force when a state is measured is the answer to an earlier state.
         newest = np.searchsorted(commands.answers, np.arange(len(run.time)), side="left") - 1
@@ -201,7 +201,7 @@ class Signals:
                 np.zeros(4),
             )
             mode = 10 if row >= 0 and commands.servo[row] else 0
-            action = previous_action(commands.q[row], mode) if row >= 0 else np.zeros(12)
+            action = previous_action(ALIENGO, commands.q[row], mode) if row >= 0 else np.zeros(12)
             try:
                 found[k] = estimator.update(state, action)[0]
             except FloatingPointError:

@@ -113,7 +113,7 @@ def run_campaign(
 @cache
 def _networks() -> tuple[PolicyFile, LearnedEstimator]:
     """Load the shipped networks once per process."""
-    return PolicyFile(), LearnedEstimator()
+    return PolicyFile(ALIENGO), LearnedEstimator(ALIENGO)
 
 
 def run_case(case: Case, seed: int) -> FaultRun:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from quadvel_description.arrays import Array
+from quadvel_description.robot import ALIENGO
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
-from quadvel_driver.aliengo import ALIENGO
 from quadvel_driver.link import MAX_COMMAND_AGE_MS, clamp_for_board
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
@@ -154,7 +154,7 @@ class Stack:
         self.sensor_fault: Callable[[int, RobotState], RobotState] | None = None
         self.processes = {name: Process() for name in ("controller", "estimator", "mux", "planner")}
         config = ControlConfig()
-        self.supervisor = Supervisor(policy, config.supervisor, KalmanEstimator(), guards)
+        self.supervisor = Supervisor(ALIENGO, policy, config.supervisor, KalmanEstimator(ALIENGO), guards)
         self._loop = ControlLoop(self.supervisor, config, self._answer, self._clock, steady=self._steady)
         self._tracker = VelocityTracker(estimator)
         self._mux = CommandMux([PLANNER])
@@ -240,7 +240,7 @@ class Stack:
     def _command_to_estimator(self, message: Message) -> None:
         """Estimator: take the joint command, its previous action."""
         self.processes["estimator"].submit(
-            lambda: self._tracker.set_previous_action(previous_action(message.q, message.mode))
+            lambda: self._tracker.set_previous_action(previous_action(ALIENGO, message.q, message.mode))
         )
 
     def _state_to_controller(self, message: Message) -> None:

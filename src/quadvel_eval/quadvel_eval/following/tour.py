@@ -114,7 +114,7 @@ class Tour:
             SimulatorConfig(robot=ALIENGO, world=self.world, seed=setup.seed, **setup.plant)
         )
         self.simulator.reset("stand")
-        supervisor = Supervisor(PolicyFile(setup.policy), backup=KalmanEstimator())
+        supervisor = Supervisor(ALIENGO, PolicyFile(ALIENGO, setup.policy), backup=KalmanEstimator(ALIENGO))
         estimator = make_estimator(setup.estimator, self.simulator, setup.estimator_file)
         self._loop = RobotLoop(self.simulator, supervisor, estimator)
         laser = self.world.laser

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from quadvel_description.robot import ALIENGO
 from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
 
@@ -128,7 +129,7 @@ def command_limits(study: Study, policy: str) -> VelocityCommandLimits:
     Returns:
         The limits.
     """
-    return PolicyFile(study.policies[policy]).metadata.limits
+    return PolicyFile(ALIENGO, study.policies[policy]).metadata.limits
 
 
 def is_within_limits(command: Command, bounds: VelocityCommandLimits) -> bool:

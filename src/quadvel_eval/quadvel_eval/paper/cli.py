@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 from rich.console import Console
 
+from quadvel_description.robot import ALIENGO
 from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_recordings.output import output_folder
@@ -68,8 +69,8 @@ def paper_command(
         seeds=seeds,
     )
     for path in study.policies.values():
-        PolicyFile(path)  # fail on a bad file here, once, before any run
-    LearnedEstimator(estimator_file)
+        PolicyFile(ALIENGO, path)  # fail on a bad file here, once, before any run
+    LearnedEstimator(ALIENGO, estimator_file)
     sections = _sections(only or [])
     folder = output_folder(out)
     with walk_progress_bar() as bar:

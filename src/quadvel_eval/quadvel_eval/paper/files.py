@@ -16,6 +16,7 @@ from typing import Any
 import attrs
 from matplotlib.figure import Figure
 
+from quadvel_description.robot import ALIENGO
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_recordings.output import atomic_write
 
@@ -93,7 +94,7 @@ def _empty_figure() -> Figure:
 
 def _policy_info(path: Path) -> dict[str, Any]:
     """File name, command limits and recipe of a policy."""
-    metadata = PolicyFile(path).metadata
+    metadata = PolicyFile(ALIENGO, path).metadata
     limits = {axis: list(bounds) for axis, bounds in metadata.command_limits.items()}
     return {"file": path.name, "command_limits": limits, "recipe": metadata.recipe}
 

@@ -128,7 +128,7 @@ def record_mixed_walk(setup: Setup, seed: int, bounds: VelocityCommandLimits) ->
     simulator = RecordingSimulator(SimulatorConfig(**{"robot": ALIENGO, "seed": seed, **setup.plant}))
     simulator.reset("stand")
     estimator = make_estimator(setup.estimator, simulator, setup.estimator_file)
-    loop = RobotLoop(simulator, Supervisor(PolicyFile(setup.policy)), estimator)
+    loop = RobotLoop(simulator, Supervisor(ALIENGO, PolicyFile(ALIENGO, setup.policy)), estimator)
     loop.start_walking()
     start = simulator.time
     fast, aside, turn = bounds.high

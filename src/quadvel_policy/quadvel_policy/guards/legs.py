@@ -8,7 +8,6 @@ import numpy as np
 from typing_extensions import override
 
 from quadvel_description.quadruped import JOINT_NAMES, LEGS
-from quadvel_description.robot import LOWER, TORQUE_LIMIT, UPPER
 from quadvel_description.state import MODE_DAMPING
 
 from ..guard import MOVING_MODES, WALK_MODES, Guard, GuardInput, Level
@@ -26,9 +25,9 @@ class JointOutOfRange(Guard):
     def check(self, data: GuardInput) -> str | None:
         if data.is_sound:
             return None
-        q = data.state.q
-        for i in np.flatnonzero(np.maximum(LOWER - q, q - UPPER) > data.config.joint_margin):
-            return f"{JOINT_NAMES[i]} is at {q[i]:.2f} rad, its range is {LOWER[i]:.2f} to {UPPER[i]:.2f}"
+        q, lower, upper = data.state.q, data.robot.lower, data.robot.upper
+        for i in np.flatnonzero(np.maximum(lower - q, q - upper) > data.config.joint_margin):
+            return f"{JOINT_NAMES[i]} is at {q[i]:.2f} rad, its range is {lower[i]:.2f} to {upper[i]:.2f}"
         return None
 
 
@@ -39,7 +38,7 @@ class JointTooFast(Guard):
     def check(self, data: GuardInput) -> str | None:
         if data.is_sound:
             return None
-        limit = data.config.joint_speeds
+        limit = data.bounds.speed
         for i in np.flatnonzero(np.abs(data.state.dq) > limit):
             return f"{JOINT_NAMES[i]} moves at {data.state.dq[i]:.0f} rad/s, limit {limit[i]:.0f}"
         return None
@@ -68,7 +67,7 @@ class EncoderInconsistent(Guard):
             unexplained = data.motion - 0.5 * data.gap * (data.state.dq + data.previous.dq)
         else:  # after a gap the path is unknown; count only motion beyond the largest speed
             unexplained = np.sign(data.motion) * np.maximum(
-                np.abs(data.motion) - data.config.joint_speeds * data.gap, 0.0
+                np.abs(data.motion) - data.bounds.speed * data.gap, 0.0
             )
         self._error *= math.exp(-data.gap / ENCODER_WINDOW_S)
         self._error += unexplained
@@ -133,7 +132,8 @@ class DriveDoesNotAnswer(Guard):
             return None
         share = -math.expm1(-max(data.gap, 0.0) / TORQUE_WINDOW_S)
         expected, reported = self._means
-        np.minimum(np.maximum(data.commanded_torque, -TORQUE_LIMIT), TORQUE_LIMIT, out=self._now[0])
+        limit = data.robot.torque_limit
+        np.minimum(np.maximum(data.commanded_torque, -limit), limit, out=self._now[0])
         self._now[1] = data.state.tau
         self._means += share * (self._now - self._means)
         error = np.abs(reported - expected)
@@ -156,7 +156,7 @@ class JointStuck(Guard):
     @override
     def check(self, data: GuardInput) -> str | None:
         q = data.state.q
-        pushes = np.abs(data.state.tau) > data.config.stuck_torque * TORQUE_LIMIT
+        pushes = np.abs(data.state.tau) > data.config.stuck_torque * data.robot.torque_limit
         if not np.count_nonzero(pushes):  # the usual case
             self._time[:], self._stuck_at = 0.0, q
             return None
