@@ -18,6 +18,7 @@ from viser._tunnel import ViserTunnel
 from websockets.asyncio.client import unix_connect
 from websockets.typing import Subprotocol
 
+from quadvel_description.robot import ALIENGO
 from quadvel_view.access_control import is_loopback
 from quadvel_view.scene_server import SceneServer, SceneServerError, client_page
 from quadvel_view.server import AddressError
@@ -96,7 +97,7 @@ def test_a_folder_for_temporary_files_whose_name_is_too_long_for_a_socket_is_nam
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     with pytest.raises(AddressError, match=r"x{100}.*TMPDIR"):
-        Viewer("127.0.0.1", 0, lambda *_: None, lambda _: None)
+        Viewer(ALIENGO, "127.0.0.1", 0, lambda *_: None, lambda _: None)
     assert list(folder.iterdir()) == []
 
 
