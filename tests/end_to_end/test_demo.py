@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from quadvel_actuator import ActuatorParameters
 from quadvel_bringup import cli
 from quadvel_recordings.reading import read_messages
+from tests.helpers.robots import ALIENGO
 
 QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
 VIEWED = ("/tf", "/tf_static", "/robot_description")
@@ -54,7 +55,7 @@ def test_a_short_demo_walks_without_a_fall_and_judges_itself(out: Path) -> None:
 
 def test_a_demo_whose_robot_cannot_stand_up_ends_with_its_cause_and_exit_code_1(tmp_path: Path) -> None:
     weak = tmp_path / "weak.yaml"
-    attrs.evolve(ActuatorParameters.default(), torque_limit=2.0).save(weak)
+    attrs.evolve(ActuatorParameters.of(ALIENGO), torque_limit=2.0).save(weak)
     command = [*QUADVEL, "demo", "--quick", "--lockstep", "--no-video", "--out", str(tmp_path / "out")]
     ended = subprocess.run([*command, "--actuator", str(weak)], capture_output=True, text=True, timeout=240)
     assert ended.returncode == 1, ended.stdout + ended.stderr

@@ -25,6 +25,7 @@ from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_bringup import cli
 from quadvel_bringup.processes import ProcessGroup
 from quadvel_policy.policy_file import SHIPPED_POLICY
+from tests.helpers.robots import ALIENGO
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("*.md", "docs/**/*.md", "src/*/README.md", "training/README.md", "ros_ws/README.md")
@@ -249,7 +250,7 @@ def leg_log(seed: int, with_torque: bool) -> dict[str, np.ndarray]:
     sent = 0.3 * np.sin(2 * np.pi * t[:, None] * pace + phase) + 0.1 * np.sin(
         2 * np.pi * 5.3 * t[:, None] * pace
     )
-    drives = ActuatorModel(ActuatorParameters.default(), shape=(12,), seed=seed)
+    drives = ActuatorModel(ActuatorParameters.of(ALIENGO), shape=(12,), seed=seed)
     q, dq, rows = sent[0].copy(), np.zeros(3), []
     for wanted in sent:
         padded = [np.concatenate([x, np.zeros(9)]) for x in (q, dq, wanted)]

@@ -12,6 +12,7 @@ import pytest
 from quadvel_actuator import ActuatorParameters
 from quadvel_eval.replay import torque_error
 from quadvel_lab.ground_truth_benchmark import PLANTS, read_walk
+from tests.helpers.robots import ALIENGO
 
 PROGRAM = """
 import sys
@@ -39,6 +40,6 @@ def test_a_plant_walks_and_its_recording_shows_that_the_stacks_model_lacks_somet
     assert walk.segments[0].error_xy < 0.15
     assert walk.joints.recorded.mean() > 0.99
     ((start, end, _),) = walk.stretches
-    model = ActuatorParameters.default()
+    model = ActuatorParameters.of(ALIENGO)
     assert torque_error(model, walk.joints, start, end) > 3 * model.torque_noise
     assert np.isfinite(walk.joints.q).all()

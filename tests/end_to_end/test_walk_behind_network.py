@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_description.robot import ALIENGO, NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver import wire
 from quadvel_driver.board_state import BoardState
@@ -23,6 +22,7 @@ from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.bad_network import BadNetwork, NetworkConfig
 from quadvel_sim.simulator import Simulator
+from tests.helpers.robots import ALIENGO
 
 BAD = NetworkConfig(network_loss=0.02, network_jitter=0.002)
 TURNS = 4  # of the link, a millisecond
@@ -87,7 +87,7 @@ class BehindNetwork:
         for _ in range(n):
             if self._warming_up:
                 self._simulator.command(
-                    JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+                    JointCommand(q=np.array(ALIENGO.nominal_q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
                 )
             self._simulator.step(1)
             self._report()

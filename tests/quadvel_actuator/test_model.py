@@ -6,6 +6,7 @@ import pytest
 from scipy import stats
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters, DelayPair
+from tests.helpers.robots import ALIENGO
 
 Q = np.linspace(-0.4, 0.5, 12)
 ZERO = np.zeros(12)
@@ -14,7 +15,7 @@ UNLIMITED = 1e6
 
 def _parameters(input_delay=0.0, output_delay=0.0, noise=0.0, limit=UNLIMITED, delta_kp=0.0, delta_kd=0.0):
     return attrs.evolve(
-        ActuatorParameters.default(),
+        ActuatorParameters.of(ALIENGO),
         pairs=[DelayPair(input_delay, output_delay, noise)],
         torque_noise=noise,
         torque_limit=limit,
@@ -84,7 +85,7 @@ def test_gain_deviations_may_differ_between_joints_and_scale_with_the_gains():
 
 
 def test_damping_without_stiffness_never_drives_the_joint():
-    model = ActuatorModel(attrs.evolve(ActuatorParameters.default(), torque_noise=0.0))
+    model = ActuatorModel(attrs.evolve(ActuatorParameters.of(ALIENGO), torque_noise=0.0))
     dq = np.linspace(-5, 5, 12)
     torque = model.step(Q, dq, ZERO, 0.0, 2.0)
     np.testing.assert_allclose(torque, -2.0 * (0.5 - 0.021) / 0.5 * dq, atol=1e-12)
@@ -167,7 +168,8 @@ def test_environments_with_their_own_parameters_equal_single_runs():
 
 def test_sampling_stays_within_the_probable_set_and_fills_it():
     parameters = attrs.evolve(
-        ActuatorParameters.default(), pairs=[*ActuatorParameters.default().pairs, DelayPair(0.02, 0.02, 1.0)]
+        ActuatorParameters.of(ALIENGO),
+        pairs=[*ActuatorParameters.of(ALIENGO).pairs, DelayPair(0.02, 0.02, 1.0)],
     )
     model = ActuatorModel(parameters, (2000, 12))
     model.sample(rng=np.random.default_rng(6))
@@ -181,7 +183,7 @@ def test_sampling_stays_within_the_probable_set_and_fills_it():
 
 
 def test_sampling_some_environments_does_not_change_the_others():
-    model = ActuatorModel(ActuatorParameters.default(), (6, 12))
+    model = ActuatorModel(ActuatorParameters.of(ALIENGO), (6, 12))
     model.sample([1, 4], np.random.default_rng(7))
     changed = (model.kp_scale != 1 - 0.706 / 30).any(axis=1)
     np.testing.assert_array_equal(changed, [False, True, False, False, True, False])
@@ -189,7 +191,7 @@ def test_sampling_some_environments_does_not_change_the_others():
 
 def test_the_same_seed_gives_the_same_torques_bit_for_bit():
     def run(seed):
-        model = ActuatorModel(ActuatorParameters.default(), (5, 12), seed=seed)
+        model = ActuatorModel(ActuatorParameters.of(ALIENGO), (5, 12), seed=seed)
         model.sample()
         return np.array([model.step(Q, Q, Q * k, 30.0, 0.5) for k in range(300)])
 
@@ -207,4 +209,4 @@ def test_a_delay_out_of_range_is_refused():
 
 def test_parameters_for_another_number_of_joints_are_refused():
     with pytest.raises(ValueError, match="torque_limit: found 3 numbers, expected 1 or 2"):
-        ActuatorModel(ActuatorParameters.default(), (2,))
+        ActuatorModel(ActuatorParameters.of(ALIENGO), (2,))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters, DelayPair
+from tests.helpers.robots import ALIENGO
 
 KP, KD = 30.0, 0.5
 TARGET = 0.3 * np.sin(np.arange(600) * 0.02) * (np.arange(600) > 20)  # rad, at rest at first
@@ -27,7 +28,7 @@ def _pendulum(actuator: str) -> mujoco.MjModel:
 
 def _model(input_delay: float, output_delay: float) -> ActuatorModel:
     pair = DelayPair(input_delay, output_delay, 0.0)
-    parameters = attrs.evolve(ActuatorParameters.ideal(), pairs=(pair,), torque_limit=40.0)
+    parameters = attrs.evolve(ActuatorParameters.ideal(ALIENGO), pairs=(pair,), torque_limit=40.0)
     return ActuatorModel(parameters, (1,))
 
 

@@ -5,18 +5,19 @@ import pytest
 import yaml
 
 from quadvel_actuator import ActuatorParameters, DelayPair, Effect
+from tests.helpers.robots import ALIENGO
 
 
 def _written(tmp_path, **changes):
     path = tmp_path / "changed.yaml"
-    ActuatorParameters.default().save(path)
+    ActuatorParameters.of(ALIENGO).save(path)
     values = yaml.safe_load(path.read_text()) | changes
     path.write_text(yaml.safe_dump({key: value for key, value in values.items() if value is not None}))
     return path
 
 
 def test_the_shipped_default_is_table_4():
-    shipped = ActuatorParameters.default()
+    shipped = ActuatorParameters.of(ALIENGO)
     assert (shipped.kp_ref, shipped.kd_ref, shipped.delta_kp, shipped.delta_kd) == (30.0, 0.5, -0.706, -0.021)
     assert shipped.torque_noise == 0.066
     assert shipped.best_pair == DelayPair(0.007, 0.001, 0.066)
@@ -29,12 +30,12 @@ def test_the_shipped_default_is_table_4():
 def test_probable_pairs_lie_under_one_and_a_half_times_the_least_error():
     errors = [0.5, 0.25, 0.374, 0.375]
     pairs = [DelayPair(0.001 * i, 0.0, error) for i, error in enumerate(errors)]
-    parameters = attrs.evolve(ActuatorParameters.default(), pairs=pairs)
+    parameters = attrs.evolve(ActuatorParameters.of(ALIENGO), pairs=pairs)
     assert [pair.mse for pair in parameters.probable_pairs] == [0.25, 0.374]
 
 
 def test_ideal_is_a_plain_pd_law():
-    ideal = ActuatorParameters.ideal()
+    ideal = ActuatorParameters.ideal(ALIENGO)
     assert (ideal.delta_kp, ideal.delta_kd, ideal.torque_noise) == (0.0, 0.0, 0.0)
     assert ideal.probable_pairs == (DelayPair(0.0, 0.0, 0.0),)
 
@@ -44,7 +45,7 @@ def test_saved_parameters_load_unchanged_with_their_effects(tmp_path):
         "friction", ["FR_hip_joint"], {"coulomb": 0.4}, {"coulomb": "N m"}, {"coulomb": [0.35, 0.45]}
     )
     saved = attrs.evolve(
-        ActuatorParameters.default(), delta_kp=[-0.1 * i for i in range(12)], effects=[effect]
+        ActuatorParameters.of(ALIENGO), delta_kp=[-0.1 * i for i in range(12)], effects=[effect]
     )
     saved.save(tmp_path / "saved.yaml")
     assert ActuatorParameters.load(tmp_path / "saved.yaml") == saved

@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters, DelayPair
+from tests.helpers.robots import ALIENGO
 
 STEPS = 2000
 
 
 def parameters(input_delay: float, output_delay: float) -> ActuatorParameters:
-    return attrs.evolve(ActuatorParameters.default(), pairs=(DelayPair(input_delay, output_delay, 0.0),))
+    return attrs.evolve(ActuatorParameters.of(ALIENGO), pairs=(DelayPair(input_delay, output_delay, 0.0),))
 
 
 def run(model: ActuatorModel, peek_every: int) -> np.ndarray:

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from quadvel_description import kinematics, mjcf, robot
+from quadvel_description import kinematics, mjcf
 from quadvel_description.quadruped import LEGS
-from quadvel_description.robot import ALIENGO
+from tests.helpers.robots import ALIENGO
 
 
 def _random_q(count: int, seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(robot.LOWER, robot.UPPER, size=(count, 12))
+    return np.random.default_rng(seed).uniform(ALIENGO.lower, ALIENGO.upper, size=(count, 12))
 
 
 def _standing_q(count: int, seed: int) -> np.ndarray:
@@ -31,7 +31,7 @@ def _wxyz(rotation: Rotation) -> np.ndarray:
 
 
 def test_foot_positions_are_those_of_mujoco():
-    model = mjcf.load_model()
+    model = mjcf.load_model(ALIENGO)
     data = mujoco.MjData(model)
     for q in _random_q(50, 0):
         data.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *q]
@@ -62,7 +62,7 @@ def test_inverse_kinematics_undoes_the_forward_one():
 
 
 def test_a_foot_out_of_reach_is_placed_in_its_direction_on_a_straight_leg():
-    feet = kinematics.foot_positions(ALIENGO, robot.NOMINAL_Q)
+    feet = kinematics.foot_positions(ALIENGO, ALIENGO.nominal_q)
     far = feet - np.array([0.0, 0.0, 1.0])
     reached = kinematics.foot_positions(ALIENGO, kinematics.inverse_kinematics(ALIENGO, far))
     assert np.isfinite(reached).all()
@@ -70,8 +70,8 @@ def test_a_foot_out_of_reach_is_placed_in_its_direction_on_a_straight_leg():
 
 
 def test_the_stance_has_its_feet_below_the_hips():
-    feet = kinematics.foot_positions(ALIENGO, robot.NOMINAL_Q)
-    np.testing.assert_allclose(feet[:, 2], robot.FOOT_RADIUS - robot.NOMINAL_HEIGHT, atol=1e-4)
+    feet = kinematics.foot_positions(ALIENGO, ALIENGO.nominal_q)
+    np.testing.assert_allclose(feet[:, 2], ALIENGO.foot_radius - ALIENGO.nominal_height, atol=1e-4)
     np.testing.assert_allclose(feet[:, 0], ALIENGO.legs.hips[:, 0], atol=1e-4)
 
 

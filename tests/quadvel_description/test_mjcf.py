@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadvel_description import kinematics, mjcf, robot
+from quadvel_description import kinematics, mjcf
 from quadvel_description.quadruped import GRAVITY, JOINT_NAMES, LEGS
-from quadvel_description.robot import ALIENGO
+from tests.helpers.robots import ALIENGO
 
 
 def _in(model: mujoco.MjModel, keyframe: str) -> mujoco.MjData:
@@ -16,64 +16,64 @@ def _in(model: mujoco.MjModel, keyframe: str) -> mujoco.MjData:
     return data
 
 
-@pytest.mark.parametrize(("keyframe", "q"), [("stand", robot.NOMINAL_Q), ("lie", robot.LIE_Q)])
+@pytest.mark.parametrize(("keyframe", "q"), [("stand", ALIENGO.nominal_q), ("lie", ALIENGO.lie_q)])
 def test_in_a_keyframe_the_feet_touch_the_ground_and_nothing_reaches_below_it(keyframe, q):
-    model = mjcf.load_model()
+    model = mjcf.load_model(ALIENGO)
     data = _in(model, keyframe)
     np.testing.assert_array_equal(data.qpos[7:], q)
-    soles = [data.geom(f"{leg}_foot").xpos[2] - robot.FOOT_RADIUS for leg in LEGS]
+    soles = [data.geom(f"{leg}_foot").xpos[2] - ALIENGO.foot_radius for leg in LEGS]
     np.testing.assert_allclose(soles, 0.0, atol=5e-4)
     assert (data.contact.dist > -5e-4).all()
     assert all(model.geom(geom).name.endswith("_foot") for geom in data.contact.geom2)
 
 
 def test_the_robot_stands_on_its_gains_and_the_torque_against_gravity():
-    model = mjcf.load_model()
+    model = mjcf.load_model(ALIENGO)
     data = _in(model, "stand")
     feedforward = mjcf.gravity_torque(model)
-    assert (np.abs(feedforward) < 0.5 * robot.TORQUE_LIMIT).all()
+    assert (np.abs(feedforward) < 0.5 * ALIENGO.torque_limit).all()
     for _ in range(1000):
-        servo = robot.KP * (robot.NOMINAL_Q - data.qpos[7:]) - robot.KD * data.qvel[6:]
+        servo = ALIENGO.kp * (ALIENGO.nominal_q - data.qpos[7:]) - ALIENGO.kd * data.qvel[6:]
         data.ctrl[:] = servo + feedforward
         mujoco.mj_step(model, data)
-    np.testing.assert_allclose(data.qpos[:3], [0, 0, robot.NOMINAL_HEIGHT], atol=5e-3)
+    np.testing.assert_allclose(data.qpos[:3], [0, 0, ALIENGO.nominal_height], atol=5e-3)
     np.testing.assert_allclose(kinematics.roll_pitch(data.qpos[3:7]), 0.0, atol=np.radians(0.5))
-    np.testing.assert_allclose(data.qpos[7:], robot.NOMINAL_Q, atol=0.01)
+    np.testing.assert_allclose(data.qpos[7:], ALIENGO.nominal_q, atol=0.01)
 
 
 def test_the_torque_against_gravity_carries_the_weight_of_the_trunk_on_the_feet():
-    model = mjcf.load_model()
-    feet = kinematics.foot_jacobians(ALIENGO, robot.NOMINAL_Q)
+    model = mjcf.load_model(ALIENGO)
+    feet = kinematics.foot_jacobians(ALIENGO, ALIENGO.nominal_q)
     data = _in(model, "stand")
     legs = data.qfrc_bias[6:].reshape(4, 3)  # the legs' weight on a fixed trunk
     torque = mjcf.gravity_torque(model).reshape(4, 3)
     force = np.linalg.solve(np.swapaxes(feet, 1, 2), (legs - torque)[..., None])[..., 0]
-    np.testing.assert_allclose(force, np.tile([0, 0, robot.MASS * GRAVITY / 4], (4, 1)), atol=1e-6)
+    np.testing.assert_allclose(force, np.tile([0, 0, ALIENGO.mass * GRAVITY / 4], (4, 1)), atol=1e-6)
 
 
 def test_the_lying_robot_sinks_on_its_belly_upright_and_rests():
-    model = mjcf.load_model()
+    model = mjcf.load_model(ALIENGO)
     data = _in(model, "lie")
     for _ in range(12000):  # legs folded below it, it stays up for some seconds
         data.ctrl[:] = -2.0 * data.qvel[6:]
         mujoco.mj_step(model, data)
-    assert 0.05 < data.qpos[2] <= robot.LIE_HEIGHT
+    assert 0.05 < data.qpos[2] <= ALIENGO.lie_height
     assert np.abs(data.qvel).max() < 0.01
     np.testing.assert_allclose(kinematics.roll_pitch(data.qpos[3:7]), 0.0, atol=np.radians(2))
 
 
 def test_motors_stand_in_the_order_of_the_joint_table_and_keep_its_limits():
-    model = mjcf.load_model()
+    model = mjcf.load_model(ALIENGO)
     assert [model.actuator(i).name for i in range(model.nu)] == list(JOINT_NAMES)
     np.testing.assert_array_equal(
-        model.actuator_ctrlrange, np.stack([-robot.TORQUE_LIMIT, robot.TORQUE_LIMIT], 1)
+        model.actuator_ctrlrange, np.stack([-ALIENGO.torque_limit, ALIENGO.torque_limit], 1)
     )
-    np.testing.assert_array_equal(model.jnt_range[1:], np.stack([robot.LOWER, robot.UPPER], 1))
+    np.testing.assert_array_equal(model.jnt_range[1:], np.stack([ALIENGO.lower, ALIENGO.upper], 1))
 
 
 def test_the_plant_varies_the_robot():
     armature = np.linspace(0.01, 0.03, 12)
-    model = mjcf.load_model(mjcf.Plant(timestep=0.002, armature=armature, foot_friction=0.4, plane=False))
+    model = mjcf.load_model(ALIENGO, mjcf.Plant(timestep=0.002, armature=armature, plane=False))
     assert model.opt.timestep == 0.002
     np.testing.assert_array_equal(model.dof_armature[6:], armature)
     assert model.geom("FR_foot").friction[0] == 0.4
@@ -81,13 +81,13 @@ def test_the_plant_varies_the_robot():
 
 
 def test_without_leg_shapes_only_feet_and_trunk_collide():
-    model = mjcf.load_model(mjcf.Plant(only_feet_and_trunk=True))
+    model = mjcf.load_model(ALIENGO, mjcf.Plant(only_feet_and_trunk=True))
     colliding = {model.geom(i).name for i in range(model.ngeom) if model.geom_conaffinity[i]}
     assert colliding == {"trunk", *(f"{leg}_foot" for leg in LEGS)}
 
 
 def test_the_imu_of_a_robot_at_rest_feels_gravity():
-    model = mjcf.load_model()
+    model = mjcf.load_model(ALIENGO)
     data = _in(model, "lie")
     for _ in range(2500):
         data.ctrl[:] = -2.0 * data.qvel[6:]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from quadvel_description import robot
 from quadvel_description.quadruped import JOINT_NAMES, joint_index
+from tests.helpers.robots import ALIENGO
 
 # mass (kg), centre of mass (m) and inertia (ixx iyy izz ixy ixz iyz, kg mm^2), worked out apart
 LUMPED = {
@@ -23,11 +23,11 @@ LUMPED = {
 
 
 def test_the_robot_weighs_what_its_links_weigh():
-    assert abs(robot.MASS - (24.936 + 0.001)) < 1e-9  # the IMU is the last gram
+    assert abs(ALIENGO.mass - (24.936 + 0.001)) < 1e-9  # the IMU is the last gram
 
 
 def test_the_trunk_carries_its_hip_rotors_and_the_imu():
-    trunk = robot.combined_inertial("trunk")
+    trunk = ALIENGO.combined_inertial("trunk")
     assert trunk.mass == pytest.approx(12.228 + 0.001)
     np.testing.assert_allclose(trunk.com, (0.008390, 0.003656, 0.000260), atol=1e-6)
     inertia = (0.054026921, 0.258759810, 0.284296015, 0.001684806, 0.000234603, 0.000119200)
@@ -38,14 +38,14 @@ def test_the_trunk_carries_its_hip_rotors_and_the_imu():
 @pytest.mark.parametrize("name", LUMPED)
 def test_links_carry_their_rotors(name):
     mass, com, micro = LUMPED[name]
-    lumped = robot.combined_inertial(name)
+    lumped = ALIENGO.combined_inertial(name)
     assert lumped.mass == pytest.approx(mass, abs=1e-9)
     np.testing.assert_allclose(lumped.com, com, atol=1e-6)
     np.testing.assert_allclose(np.array(lumped.fullinertia()) * 1e6, micro, atol=1e-3)
 
 
 def test_every_inertia_is_that_of_a_real_body():
-    for link in robot.LINKS:
+    for link in ALIENGO.links:
         moments = np.linalg.eigvalsh(link.inertial.tensor)
         assert (moments > 0).all(), link.name
         assert moments[2] <= moments[0] + moments[1] + 1e-12, link.name
@@ -64,17 +64,17 @@ def test_an_unknown_joint_is_refused_by_name():
 
 
 def test_postures_and_commands_lie_within_the_mechanical_range():
-    for q in (robot.NOMINAL_Q, robot.LIE_Q, robot.COMMAND_LOWER, robot.COMMAND_UPPER):
-        assert (q >= robot.LOWER).all()
-        assert (q <= robot.UPPER).all()
+    for q in (ALIENGO.nominal_q, ALIENGO.lie_q, ALIENGO.command_lower, ALIENGO.command_upper):
+        assert (q >= ALIENGO.lower).all()
+        assert (q <= ALIENGO.upper).all()
 
 
 def test_hips_may_be_commanded_further_outward_than_inward():
     hips = joint_index(["FR_hip", "FL_hip"])  # positive: right foot inward, left foot outward
-    np.testing.assert_array_equal(robot.COMMAND_LOWER[hips], [-1.047, -0.873])
-    np.testing.assert_array_equal(robot.COMMAND_UPPER[hips], [0.873, 1.047])
+    np.testing.assert_array_equal(ALIENGO.command_lower[hips], [-1.047, -0.873])
+    np.testing.assert_array_equal(ALIENGO.command_upper[hips], [0.873, 1.047])
 
 
 def test_tables_cannot_be_changed_by_accident():
     with pytest.raises(ValueError, match="read-only"):
-        robot.NOMINAL_Q[0] = 1.0
+        ALIENGO.nominal_q[0] = 1.0

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadvel_description import kinematics, mjcf, robot, symmetry
+from quadvel_description import kinematics, mjcf, symmetry
 from quadvel_description.quadruped import LEGS
-from quadvel_description.robot import ALIENGO
+from tests.helpers.robots import ALIENGO
 
 MIRROR = np.array([1.0, -1.0, 1.0])  # across the sagittal plane
 OPPOSITE = {"FR": "FL", "FL": "FR", "RR": "RL", "RL": "RR"}
@@ -18,8 +18,8 @@ def _opposite(body: str) -> str:
 
 def _mirrored_model(plant: mjcf.Plant) -> mujoco.MjModel:
     """The robot whose every link has the inertia of its opposite's mirror image."""
-    original = mjcf.build_spec(plant)
-    spec = mjcf.build_spec(plant)
+    original = mjcf.build_spec(ALIENGO, plant)
+    spec = mjcf.build_spec(ALIENGO, plant)
     for body in spec.bodies:
         if body.name == "world":
             continue
@@ -70,23 +70,23 @@ def test_a_mirrored_command_turns_and_steps_the_other_way():
 
 
 def test_mirrored_joints_put_the_feet_at_mirrored_places():
-    q = np.random.default_rng(1).uniform(robot.LOWER, robot.UPPER, size=(20, 12))
+    q = np.random.default_rng(1).uniform(ALIENGO.lower, ALIENGO.upper, size=(20, 12))
     feet = kinematics.foot_positions(ALIENGO, q)
     mirrored = kinematics.foot_positions(ALIENGO, symmetry.mirror_joints(q))
     np.testing.assert_allclose(mirrored, feet[:, symmetry.FEET.index] * MIRROR, atol=1e-12)
 
 
 def test_stances_and_limits_are_their_own_mirror_image():
-    for q in (robot.NOMINAL_Q, robot.LIE_Q):
+    for q in (ALIENGO.nominal_q, ALIENGO.lie_q):
         np.testing.assert_array_equal(symmetry.mirror_joints(q), q)
-    for lower, upper in ((robot.LOWER, robot.UPPER), (robot.COMMAND_LOWER, robot.COMMAND_UPPER)):
+    for lower, upper in ((ALIENGO.lower, ALIENGO.upper), (ALIENGO.command_lower, ALIENGO.command_upper)):
         ends = np.sort(symmetry.mirror_joints(np.stack([lower, upper])), axis=0)
         np.testing.assert_array_equal(ends, [lower, upper])
 
 
 def test_only_trunk_and_calves_are_a_little_asymmetric():
     plant = mjcf.Plant()
-    model, mirrored = mjcf.load_model(plant), _mirrored_model(plant)
+    model, mirrored = mjcf.load_model(ALIENGO, plant), _mirrored_model(plant)
     shift = np.abs(model.body_ipos - mirrored.body_ipos).max(axis=1)
     moved = {model.body(i).name for i in np.flatnonzero(shift > 1e-9)}
     assert moved == {"trunk", *(f"{leg}_calf" for leg in LEGS)}
@@ -96,7 +96,7 @@ def test_only_trunk_and_calves_are_a_little_asymmetric():
 @pytest.mark.parametrize("seed", range(3))
 def test_the_mirrored_robot_moves_as_the_mirror_image(seed):
     plant = mjcf.Plant()
-    model, mirrored = mjcf.load_model(plant), _mirrored_model(plant)
+    model, mirrored = mjcf.load_model(ALIENGO, plant), _mirrored_model(plant)
     rng = np.random.default_rng(seed)
     data, image = mujoco.MjData(model), mujoco.MjData(mirrored)
     mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
@@ -105,7 +105,7 @@ def test_the_mirrored_robot_moves_as_the_mirror_image(seed):
     touching = 0
     for k in range(400):
         if k % 20 == 0:
-            torque = rng.uniform(-0.4, 0.4, 12) * robot.TORQUE_LIMIT
+            torque = rng.uniform(-0.4, 0.4, 12) * ALIENGO.torque_limit
         data.ctrl[:] = torque
         image.ctrl[:] = symmetry.mirror_joints(torque)
         mujoco.mj_step(model, data)

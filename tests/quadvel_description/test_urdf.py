@@ -6,11 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadvel_description import kinematics, mjcf, robot
+from quadvel_description import kinematics, mjcf
 from quadvel_description.frames import BASE
 from quadvel_description.quadruped import JOINT_NAMES, LEGS
-from quadvel_description.robot import ALIENGO, load_robot
+from quadvel_description.robot import load_robot
 from quadvel_description.urdf_generator import generate_urdf
+from tests.helpers.robots import ALIENGO
 
 KEEP_FIXED_LINKS = '<mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
 
@@ -24,13 +25,13 @@ def imported() -> mujoco.MjModel:
 
 @pytest.fixture(scope="module")
 def simulated() -> mujoco.MjModel:
-    return mjcf.load_model(mjcf.Plant(plane=False))
+    return mjcf.load_model(ALIENGO, mjcf.Plant(plane=False))
 
 
 def _postures(imported: mujoco.MjModel, simulated: mujoco.MjModel, count: int):
     """Postures, and the URDF's and the MJCF's MjData in them, with the trunk at the origin."""
     first, second = mujoco.MjData(imported), mujoco.MjData(simulated)
-    for q in np.random.default_rng(0).uniform(robot.LOWER, robot.UPPER, size=(count, 12)):
+    for q in np.random.default_rng(0).uniform(ALIENGO.lower, ALIENGO.upper, size=(count, 12)):
         for name, angle in zip(JOINT_NAMES, q, strict=True):
             first.joint(name).qpos = angle
         second.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *q]
@@ -41,8 +42,8 @@ def _postures(imported: mujoco.MjModel, simulated: mujoco.MjModel, count: int):
 
 
 def test_urdf_and_mjcf_weigh_the_same(imported, simulated):
-    assert imported.body_mass.sum() == pytest.approx(robot.MASS, abs=1e-9)
-    assert simulated.body_mass.sum() == pytest.approx(robot.MASS, abs=1e-9)
+    assert imported.body_mass.sum() == pytest.approx(ALIENGO.mass, abs=1e-9)
+    assert simulated.body_mass.sum() == pytest.approx(ALIENGO.mass, abs=1e-9)
 
 
 def test_urdf_and_mjcf_have_the_same_centre_of_mass(imported, simulated):
@@ -94,7 +95,12 @@ def test_limits_in_the_urdf_are_those_of_the_joint_table():
     for i, name in enumerate(JOINT_NAMES):
         limit = joints[name].find("limit")
         found = [float(limit.get(key)) for key in ("lower", "upper", "effort", "velocity")]
-        assert found == [robot.LOWER[i], robot.UPPER[i], robot.TORQUE_LIMIT[i], robot.VELOCITY_LIMIT[i]]
+        assert found == [
+            ALIENGO.lower[i],
+            ALIENGO.upper[i],
+            ALIENGO.torque_limit[i],
+            ALIENGO.velocity_limit[i],
+        ]
 
 
 def test_links_form_one_tree_below_a_root_without_inertia():

@@ -11,12 +11,13 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from quadvel_description.robot import ALIENGO, NOMINAL_Q
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver import wire
 from quadvel_driver.board_state import BoardState, Remote
 from quadvel_driver.link import Link
 from quadvel_driver.udp import UdpConfig, UdpTransport
+from tests.helpers.robots import ALIENGO
 
 NO_REMOTE = Remote()
 

@@ -19,6 +19,7 @@ from quadvel_driver.find_calibration import CalibrationDataError, Samples, fit_c
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.simulator import Simulator
 from quadvel_sysid.excitation import Creep
+from tests.helpers.robots import ALIENGO
 
 DEGREE = np.pi / 180.0
 OFF = Calibration(
@@ -29,7 +30,7 @@ OFF = Calibration(
 
 def recorded(hung: bool, seconds: float, off: Calibration) -> list[RobotState]:
     """What a simulated robot reports whose sensors are off, driven to where they say it should go."""
-    simulator = Simulator(SimulatorConfig(suspended=hung, seed=3))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, suspended=hung, seed=3))
     simulator.reset("stand")
     targets = Creep(seconds=seconds).targets() if hung else np.tile(NOMINAL_Q, (round(1e3 * seconds), 1))
     states = []
@@ -53,7 +54,7 @@ def standing() -> Samples:
 
 
 def test_the_holding_torque_is_that_of_the_simulator() -> None:
-    model = load_model(Plant(suspended=True))
+    model = load_model(ALIENGO, Plant(suspended=True))
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
     for _ in range(5):
@@ -104,7 +105,7 @@ def test_what_is_set_right_is_what_was(standing: Samples) -> None:
 
 
 def test_an_imu_that_leans_to_the_right_shows_a_level_robot_rolling_to_the_right() -> None:
-    simulator = Simulator(SimulatorConfig(suspended=True))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, suspended=True))
     simulator.reset("stand")
     shown = Calibration(imu_mounting=np.array([0.1, 0.0])).as_reported(simulator.state())
     np.testing.assert_allclose(roll_pitch(shown.quaternion), [0.1, 0.0], atol=0.01)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import attrs
 import pytest
 
-from quadvel_description.robot import ALIENGO
 from quadvel_driver.board_state import Battery, BoardState
 from quadvel_driver.health import Health, Level, diagnostic_values
 from quadvel_driver.link import COUNTER_NAMES, LinkReport
+from tests.helpers.robots import ALIENGO
 
 from .conftest import standing
 

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_description.robot import ALIENGO, COMMAND_UPPER, NOMINAL_Q, TORQUE_LIMIT, VELOCITY_LIMIT
+from quadvel_description.robot import COMMAND_UPPER, NOMINAL_Q, TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_description.state import MODE_SERVO, JointCommand
 from quadvel_driver import wire
 from quadvel_driver.link import SHUTDOWN_PACKETS, LinkError, clamp_for_board
 from quadvel_driver.udp import UdpConfig, UdpTransport
+from tests.helpers.robots import ALIENGO
 
 from .conftest import TestBoard, standing
 

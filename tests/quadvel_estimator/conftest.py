@@ -16,9 +16,10 @@ from onnx import TensorProto, helper, numpy_helper
 
 import quadvel_dds
 from quadvel_description.quadruped import GRAVITY
-from quadvel_description.robot import ALIENGO, NOMINAL_Q
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_estimator import features
+from tests.helpers.robots import ALIENGO
 
 quadvel_dds.install()  # before a test module imports rclpy
 

@@ -7,9 +7,10 @@ import pytest
 
 from quadvel_description.network_input import InputLayout
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import ALIENGO, NOMINAL_Q
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_estimator import features
+from tests.helpers.robots import ALIENGO
 
 LAYOUT = features.default_layout(ALIENGO)
 

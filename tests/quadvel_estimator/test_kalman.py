@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from quadvel_description.kinematics import foot_jacobians, foot_positions, inverse_kinematics, rotation_matrix
 from quadvel_description.quadruped import GRAVITY
-from quadvel_description.robot import ALIENGO, FOOT_RADIUS, MASS, NOMINAL_HEIGHT, NOMINAL_Q
+from quadvel_description.robot import FOOT_RADIUS, MASS, NOMINAL_HEIGHT, NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator, _ground_force
 from quadvel_estimator.odometry import leg_velocity
+from tests.helpers.robots import ALIENGO
 
 DT = 0.005
 NOMINAL_FEET = foot_positions(ALIENGO, NOMINAL_Q)

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from quadvel_description.network_file import NetworkFileError
 from quadvel_description.network_input import InputLayout
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import ALIENGO
 from quadvel_description.state import RobotState
 from quadvel_estimator import features
 from quadvel_estimator.learned import LearnedEstimator
+from tests.helpers.robots import ALIENGO
 
 WriteEstimator = Callable[..., Path]
 State = Callable[..., RobotState]

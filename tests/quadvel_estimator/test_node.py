@@ -20,11 +20,12 @@ from rclpy.executors import SingleThreadedExecutor
 from tf2_msgs.msg import TFMessage
 
 from quadvel_description.kinematics import foot_positions
-from quadvel_description.robot import ALIENGO, FOOT_RADIUS, NOMINAL_Q
+from quadvel_description.robot import FOOT_RADIUS, NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator import estimator, features
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.messages import write_low_cmd, write_low_state
+from tests.helpers.robots import ALIENGO
 
 RECEIVED = {
     "velocity_estimate": TwistWithCovarianceStamped,

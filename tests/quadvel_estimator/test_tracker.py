@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from quadvel_description.robot import ALIENGO, NOMINAL_Q
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
 from quadvel_estimator import features
 from quadvel_estimator.tracker import MAX_STALE_STATES, VelocityTracker
 from quadvel_nodes.messages import MessageError
+from tests.helpers.robots import ALIENGO
 
 State = Callable[..., RobotState]
 

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from quadvel_description import mjcf, robot
-from quadvel_description.robot import ALIENGO
+from quadvel_description import mjcf
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_eval.robot_loop import RobotLoop, TrueVelocity
 from quadvel_policy.observation import PolicyMetadata, default_observation
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
+from tests.helpers.robots import ALIENGO
 
 
 class StandingPolicy:
@@ -24,10 +24,12 @@ class StandingPolicy:
             robot=ALIENGO.name,
             nominal_q=tuple(ALIENGO.nominal_q),
             observation=default_observation(ALIENGO),
-            action_offset=tuple(robot.NOMINAL_Q + mjcf.gravity_torque(mjcf.load_model()) / robot.KP),
+            action_offset=tuple(
+                ALIENGO.nominal_q + mjcf.gravity_torque(mjcf.load_model(ALIENGO)) / ALIENGO.kp
+            ),
             action_scale=1.0,
-            kp=robot.KP,
-            kd=robot.KD,
+            kp=ALIENGO.kp,
+            kd=ALIENGO.kd,
             command_limits={"vx": (-2.0, 2.0), "vy": (-1.0, 1.0), "wz": (-2.0, 2.0)},
             state_shape=(1, 1, 1),
         )
@@ -52,7 +54,7 @@ def make_loop() -> Callable[..., RobotLoop]:
     """make_loop(seed) -> a robot in walk mode under a policy that stands."""
 
     def make(seed: int = 0) -> RobotLoop:
-        simulator = Simulator(SimulatorConfig(seed=seed))
+        simulator = Simulator(SimulatorConfig(robot=ALIENGO, seed=seed))
         simulator.reset("stand")
         beside = {"kalman": KalmanEstimator(ALIENGO)}
         loop = RobotLoop(simulator, Supervisor(ALIENGO, StandingPolicy()), TrueVelocity(simulator), beside)

@@ -19,6 +19,7 @@ from quadvel_eval.paper.slopes import MAX_FOLLOWING_ERROR, STARTS, TITLES, Slope
 from quadvel_eval.segments import Segment
 from quadvel_sim.physics import HELD_OUT_PHYSICS
 from quadvel_sim.simulator import Simulator, SimulatorConfig
+from tests.helpers.robots import ALIENGO
 
 
 def answer(labels: dict, command: tuple[float, float, float], error: float | None) -> tuple[dict, CellResult]:
@@ -34,7 +35,7 @@ def test_every_condition_is_a_plant_that_stands() -> None:
     assert {one.group for one in found} == {"friction", "payload", "rough ground", "push"}
     found += [c for plant in HARD_PLANTS for c in slopes.conditions(plant, "")]
     for one in found:
-        simulator = Simulator(SimulatorConfig(**one.plant))
+        simulator = Simulator(SimulatorConfig(robot=ALIENGO, **one.plant))
         simulator.reset("stand")
         assert not simulator.fallen, one.labels
 
@@ -42,7 +43,7 @@ def test_every_condition_is_a_plant_that_stands() -> None:
 def test_the_plants_of_the_gap_differ_from_that_of_training_in_one_thing() -> None:
     drives = {one.level: one.plant["actuator"] for one in drive_conditions()}
     trained = drives.pop("as in training")
-    assert trained == ActuatorParameters.default()
+    assert trained == ActuatorParameters.of(ALIENGO)
     assert {len(p.effects) + (p.best_pair != trained.best_pair) for p in drives.values()} == {1}
     assert drives["3 ms more delay"].best_pair.input_delay_s == pytest.approx(0.010)
     q, fast = np.zeros(12), np.full(12, 15.0)

@@ -11,7 +11,6 @@ import pytest
 from mcap.writer import Writer
 
 from quadvel_actuator import ActuatorParameters
-from quadvel_description import robot
 from quadvel_description.state import MODE_SERVO, JointCommand
 from quadvel_eval.replay import (
     COMMAND_FIELDS,
@@ -24,6 +23,7 @@ from quadvel_eval.replay import (
 from quadvel_eval.segments import Segment
 from quadvel_recordings.definitions import STORE
 from quadvel_sim import SensorNoise, Simulator, SimulatorConfig, Truth
+from tests.helpers.robots import ALIENGO
 
 SECONDS = 1.5
 LowState, LowCmd = "quadvel_msgs/msg/LowState", "quadvel_msgs/msg/LowCmd"
@@ -32,14 +32,14 @@ LowState, LowCmd = "quadvel_msgs/msg/LowState", "quadvel_msgs/msg/LowCmd"
 @pytest.fixture(scope="module")
 def run() -> tuple[JointRecord, Callable[[float], Truth]]:
     """A robot with the shipped drives that sways on its feet under commands at 200 Hz, without noise."""
-    simulator = Simulator(SimulatorConfig(noise=SensorNoise.none(), seed=3))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, noise=SensorNoise.none(), seed=3))
     simulator.reset("stand")
     states, truths, rows = [], [], []
     sway = np.tile([0.1, 0.15, -0.2], 4)
     for step in range(round(SECONDS * 1000)):
         if step % 5 == 0:
-            target = robot.NOMINAL_Q + sway * np.sin(2 * np.pi * 2.0 * step * 0.001)
-            command = JointCommand(q=target, kp=np.full(12, robot.KP), kd=np.full(12, robot.KD))
+            target = ALIENGO.nominal_q + sway * np.sin(2 * np.pi * 2.0 * step * 0.001)
+            command = JointCommand(q=target, kp=np.full(12, ALIENGO.kp), kd=np.full(12, ALIENGO.kd))
             command.dq, command.tau = 0.5 * sway, 8.0 * sway
         simulator.command(command)
         states.append(simulator.state())
@@ -119,7 +119,7 @@ def test_on_the_recorded_motion_the_true_model_leaves_the_noise(
     run: tuple[JointRecord, Callable[[float], Truth]],
 ) -> None:
     joints, _ = run
-    true, ideal = ActuatorParameters.default(), ActuatorParameters.ideal()
+    true, ideal = ActuatorParameters.of(ALIENGO), ActuatorParameters.ideal(ALIENGO)
     assert torque_error(true, joints, 0.2, SECONDS) == pytest.approx(true.torque_noise, rel=0.05)
     assert torque_error(ideal, joints, 0.2, SECONDS) > 2 * true.torque_noise
 
@@ -128,9 +128,9 @@ def test_noise_of_encoders_on_which_the_drives_did_not_act_hardly_counts(
     run: tuple[JointRecord, Callable[[float], Truth]],
 ) -> None:
     joints, _ = run
-    true, rng = ActuatorParameters.default(), np.random.default_rng(0)
+    true, rng = ActuatorParameters.of(ALIENGO), np.random.default_rng(0)
     noisy = attrs.evolve(joints, dq=joints.dq + rng.normal(0.0, 0.3, joints.dq.shape))
-    through = (robot.KD * 0.3) ** 2
+    through = (ALIENGO.kd * 0.3) ** 2
     assert through > 0.3 * true.torque_noise
     assert torque_error(true, noisy, 0.2, SECONDS) < true.torque_noise + 0.3 * through
 
@@ -139,8 +139,8 @@ def test_in_open_loop_the_true_model_stays_closer_than_an_ideal_one(
     run: tuple[JointRecord, Callable[[float], Truth]],
 ) -> None:
     joints, truth = run
-    true = open_loop_error(ActuatorParameters.default(), joints, truth, 0.2, SECONDS)
-    ideal = open_loop_error(ActuatorParameters.ideal(), joints, truth, 0.2, SECONDS)
+    true = open_loop_error(ActuatorParameters.of(ALIENGO), joints, truth, 0.2, SECONDS)
+    ideal = open_loop_error(ActuatorParameters.ideal(ALIENGO), joints, truth, 0.2, SECONDS)
     assert true.stretches == ideal.stretches == 4
     assert true.q < 0.003
     assert true.dq < 0.7 * ideal.dq  # the noise of the torque alone makes half of it
@@ -152,7 +152,7 @@ def test_in_open_loop_the_true_model_stays_closer_than_an_ideal_one(
 
 def test_a_stretch_without_history_is_not_replayed(run: tuple[JointRecord, Callable[[float], Truth]]) -> None:
     with pytest.raises(ValueError, match=r"nothing to replay between 0\.00 and 0\.25 s"):
-        open_loop_error(ActuatorParameters.default(), *run, 0.0, 0.25)
+        open_loop_error(ActuatorParameters.of(ALIENGO), *run, 0.0, 0.25)
 
 
 def test_the_gap_is_the_mean_distance_of_the_mean_velocities() -> None:

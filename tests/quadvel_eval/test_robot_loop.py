@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_description.robot import ALIENGO
 from quadvel_description.state import JointCommand
 from quadvel_eval.robot_loop import RobotLoop, Sample, TrueVelocity, make_estimator
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import TickInput
 from quadvel_sim.simulator import Simulator, SimulatorConfig
+from tests.helpers.robots import ALIENGO
 
 
 def run(loop: RobotLoop, ticks: int = 60) -> list[Sample]:
@@ -64,7 +64,7 @@ def test_zero_velocity_is_a_command_to_stand_still(make_loop: Callable[..., Robo
 
 
 def test_the_supervisor_walks_on_the_estimate_of_the_state_before(standing_policy: Any) -> None:
-    simulator = Simulator(SimulatorConfig())
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO))
     simulator.reset("stand")
     used: list[object] = []
 
@@ -81,7 +81,7 @@ def test_the_supervisor_walks_on_the_estimate_of_the_state_before(standing_polic
 
 
 def test_a_refused_mode_raises_with_the_reason(standing_policy: Any) -> None:
-    simulator = Simulator(SimulatorConfig())  # lies
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO))  # lies
     loop = RobotLoop(simulator, Supervisor(ALIENGO, standing_policy), TrueVelocity(simulator))
     with pytest.raises(RuntimeError, match=r"refused stance: .* off the nominal posture"):
         loop.start_walking()
@@ -89,4 +89,4 @@ def test_a_refused_mode_raises_with_the_reason(standing_policy: Any) -> None:
 
 def test_an_unknown_estimator_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="'magic', expected one of learned, kalman, truth"):
-        make_estimator("magic", Simulator(SimulatorConfig()), tmp_path)
+        make_estimator("magic", Simulator(SimulatorConfig(robot=ALIENGO)), tmp_path)

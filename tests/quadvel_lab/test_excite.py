@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quadvel_description import robot
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_lab.excite import RAMP_S, MotionError, MotionPlayer
 from quadvel_sysid.excitation import FootLifting
 from quadvel_sysid.logs.read_log import read_log
+from tests.helpers.robots import ALIENGO
 
 PROGRAM = """
 import typer
@@ -28,7 +28,7 @@ app()
 """
 
 
-def state(seconds: float, q: np.ndarray = robot.LIE_Q, tilt: float = 0.0) -> RobotState:
+def state(seconds: float, q: np.ndarray = ALIENGO.lie_q, tilt: float = 0.0) -> RobotState:
     quaternion = np.array([np.cos(tilt / 2), np.sin(tilt / 2), 0.0, 0.0])
     rest = np.zeros(12)
     return RobotState(
@@ -44,7 +44,7 @@ def state(seconds: float, q: np.ndarray = robot.LIE_Q, tilt: float = 0.0) -> Rob
     )
 
 
-def play(player: MotionPlayer, begin: float, end: float, q: np.ndarray = robot.LIE_Q) -> JointCommand:
+def play(player: MotionPlayer, begin: float, end: float, q: np.ndarray = ALIENGO.lie_q) -> JointCommand:
     """The answer at `end`, s, after states of every 20 ms since `begin`."""
     times = np.linspace(begin, end, round((end - begin) / 0.02) + 1)
     return [player.answer(state(float(t), q)) for t in times][-1]
@@ -54,9 +54,9 @@ def test_a_motion_begins_where_the_robot_is_and_ends_in_damping() -> None:
     excitation = FootLifting(seconds=1.0)
     player, targets = MotionPlayer(excitation), excitation.targets()
     first = player.answer(state(0.0))
-    np.testing.assert_allclose(first.q, robot.LIE_Q)
+    np.testing.assert_allclose(first.q, ALIENGO.lie_q)
     assert (first.mode, first.tick) == (MODE_SERVO, 5000)
-    near = robot.NOMINAL_Q
+    near = ALIENGO.nominal_q
     np.testing.assert_allclose(play(player, 0.0, RAMP_S, near).q, targets[0], atol=1e-9)
     np.testing.assert_allclose(play(player, RAMP_S, RAMP_S + 0.25, near).q, targets[250], atol=1e-9)
     assert not player.is_done
@@ -74,15 +74,15 @@ def test_a_motion_that_would_jump_after_a_silence_or_a_step_of_the_clock_is_ende
 
 def test_a_target_is_held_back_where_the_joint_is_far_from_it() -> None:
     player = MotionPlayer(FootLifting())
-    asked = robot.KP * (play(player, 0.0, RAMP_S).q - robot.LIE_Q)
-    assert (np.abs(asked) <= robot.TORQUE_LIMIT).all()
+    asked = ALIENGO.kp * (play(player, 0.0, RAMP_S).q - ALIENGO.lie_q)
+    assert (np.abs(asked) <= ALIENGO.torque_limit).all()
 
 
 def test_a_robot_that_tips_over_or_leaves_its_range_ends_the_motion() -> None:
     with pytest.raises(MotionError, match=r"the trunk tilts by 0\.90 rad"):
         MotionPlayer(FootLifting()).answer(state(0.0, tilt=0.9))
-    q = robot.NOMINAL_Q.copy()
-    q[5] = robot.UPPER[5] + 0.2
+    q = ALIENGO.nominal_q.copy()
+    q[5] = ALIENGO.upper[5] + 0.2
     with pytest.raises(MotionError, match=r"FL_calf_joint is 0\.20 rad beyond its range"):
         MotionPlayer(FootLifting()).answer(state(0.0, q))
 
@@ -102,7 +102,7 @@ def test_a_hung_robot_is_moved_and_recorded_at_1_khz_without_gaps(tmp_path: Path
     np.testing.assert_allclose(np.diff(log.t_cmd), 0.001, atol=1e-9)
     assert log.t[-1] - log.t[0] >= RAMP_S + 0.6 - 0.002
     assert log.kp is not None
-    assert (log.kp == robot.KP).all()
+    assert (log.kp == ALIENGO.kp).all()
     swing = np.ptp(log.q[round(1e3 * RAMP_S) :], axis=0)
     assert swing.max() > 0.02
     assert sorted(path.name for path in tmp_path.iterdir()) == ["steps.mcap"]

@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
-from quadvel_description import robot
 from quadvel_description.kinematics import foot_positions, roll_pitch
 from quadvel_description.mjcf import Plant, load_model
-from quadvel_description.quadruped import GRAVITY, JOINT_NAMES
-from quadvel_description.robot import ALIENGO
+from quadvel_description.quadruped import GRAVITY, JOINT_NAMES, LEGS
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_lab.excite import MotionPlayer
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sysid.excitation import PERIOD_S, Excitation, FootLifting, Sweep
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log
+from tests.helpers.robots import ALIENGO
 
 LEVEL = 0.15  # rad, that the trunk may tilt by; the player gives up at 0.8
 Body = Callable[[JointCommand], RobotState]
@@ -41,7 +40,7 @@ def largest_tilt(states: list[RobotState]) -> float:
 
 
 def simulated(seed: int) -> tuple[RobotState, Body]:
-    simulator = Simulator(SimulatorConfig(seed=seed))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, seed=seed))
     simulator.reset("stand")
 
     def answer(command: JointCommand) -> RobotState:
@@ -55,7 +54,10 @@ def simulated(seed: int) -> tuple[RobotState, Body]:
 def other_plant(seed: int) -> tuple[RobotState, Body]:
     """Steps of 0.5 ms, pyramidal cones, stiffer contacts; friction 0.4 to 1, payload -1 to 3 kg off the middle, drawn."""
     rng = np.random.default_rng(seed)
-    model = load_model(Plant(timestep=0.0005, foot_friction=rng.uniform(0.4, 1.0)))
+    friction = rng.uniform(0.4, 1.0)
+    model = load_model(ALIENGO, Plant(timestep=0.0005))
+    for leg in LEGS:
+        model.geom(f"{leg}_foot").friction[0] = friction
     model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     model.geom_solref[:] = 0.004, 1.0
     trunk, payload = model.body("trunk").id, rng.uniform(-1.0, 3.0)
@@ -65,7 +67,7 @@ def other_plant(seed: int) -> tuple[RobotState, Body]:
     data = mujoco.MjData(model)
     mujoco.mj_setConst(model, data)
     mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
-    drives = ActuatorModel(ActuatorParameters.default(), dt=0.0005, seed=seed)
+    drives = ActuatorModel(ActuatorParameters.of(ALIENGO), dt=0.0005, seed=seed)
 
     def state() -> RobotState:
         noise, rest = rng.standard_normal((2, 12)), np.zeros(4)
@@ -122,13 +124,13 @@ def test_a_sweep_goes_through_on_the_ground(plant: Callable[[int], tuple[RobotSt
 
 def test_the_feet_carry_the_robots_weight_and_a_lifted_foot_nothing() -> None:
     torque = FootLifting(seconds=1.0).support_torque()
-    model = load_model()
+    model = load_model(ALIENGO)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
     mujoco.mj_forward(model, data)
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jac(model, data, jacobian, None, data.geom("FR_foot").xpos, model.body("FR_calf").id)
-    quarter = robot.MASS * GRAVITY / 4
+    quarter = ALIENGO.mass * GRAVITY / 4
     np.testing.assert_allclose(torque[0][:3], -quarter * jacobian[2, 6:9], atol=1e-4)
     np.testing.assert_allclose(
         torque[125][[0, 1, 2, 9, 10, 11]], 0.0, atol=1e-9
@@ -168,7 +170,7 @@ def test_the_log_of_foot_lifting_gives_the_gains_and_delays_of_the_drives() -> N
         kp=sent["kp"],
         kd=sent["kd"],
     )
-    found, own = identify([log]).parameters, ActuatorParameters.default()
+    found, own = identify([log]).parameters, ActuatorParameters.of(ALIENGO)
     assert (found.kp_ref, found.kd_ref) == (FootLifting.kp, FootLifting.kd)
     assert np.mean(found.delta_kp) / found.kp_ref == pytest.approx(
         np.mean(own.delta_kp) / own.kp_ref, rel=0.1

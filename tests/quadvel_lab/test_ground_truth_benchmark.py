@@ -15,13 +15,13 @@ import typer
 from rich.console import Console
 
 from quadvel_actuator import ActuatorParameters
-from quadvel_description import robot
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_lab import plant as plant_module
 from quadvel_lab.ground_truth_benchmark import PLANTS, SHIPPED, WALKS, _identify, plant_nodes
 from quadvel_lab.ground_truth_page import summary_sentence, twin_page
 from quadvel_lab.plant import ChafingCable, DryGear, HiddenDrives, Plant, SlowCurrent, read_plant
 from quadvel_sim import SimulatorConfig
+from tests.helpers.robots import ALIENGO
 
 DT = 0.001
 ZERO = np.zeros(12)
@@ -68,10 +68,10 @@ def test_reading_a_plants_state_does_not_alter_its_run(name: str) -> None:
     physics = read_plant(PLANTS / f"{name}.yaml")
     ends = []
     for looks in (False, True):
-        plant = Plant(SimulatorConfig(seed=1), physics)
+        plant = Plant(SimulatorConfig(robot=ALIENGO, seed=1), physics)
         plant.reset("stand")
         for step in range(120):
-            target = robot.NOMINAL_Q + 0.2 * np.sin(0.05 * step)
+            target = ALIENGO.nominal_q + 0.2 * np.sin(0.05 * step)
             plant.command(JointCommand(q=target, kp=full(30.0), kd=full(0.5)))
             if looks:
                 plant.state()
@@ -82,7 +82,9 @@ def test_reading_a_plants_state_does_not_alter_its_run(name: str) -> None:
 
 def test_a_plant_logs_its_state_every_ms_however_seldom_it_is_read() -> None:
     logged: list[RobotState] = []
-    plant = Plant(SimulatorConfig(seed=1), read_plant(PLANTS / "slow_current.yaml"), logged.append)
+    plant = Plant(
+        SimulatorConfig(robot=ALIENGO, seed=1), read_plant(PLANTS / "slow_current.yaml"), logged.append
+    )
     plant.reset("stand")
     for _ in range(3):
         state = plant.state()
@@ -92,9 +94,9 @@ def test_a_plant_logs_its_state_every_ms_however_seldom_it_is_read() -> None:
 
 
 def test_what_a_plant_reports_is_the_torque_that_its_joints_get() -> None:
-    plant = Plant(SimulatorConfig(seed=1), read_plant(PLANTS / "slow_current.yaml"))
+    plant = Plant(SimulatorConfig(robot=ALIENGO, seed=1), read_plant(PLANTS / "slow_current.yaml"))
     plant.reset("stand")
-    plant.command(JointCommand(q=np.array(robot.NOMINAL_Q), kp=full(30.0), kd=full(0.5)))
+    plant.command(JointCommand(q=np.array(ALIENGO.nominal_q), kp=full(30.0), kd=full(0.5)))
     plant.step(5)
     reported = plant.state().tau
     plant.step()
@@ -102,7 +104,7 @@ def test_what_a_plant_reports_is_the_torque_that_its_joints_get() -> None:
 
 
 def test_the_noise_of_hidden_drives_is_that_of_the_stacks_model() -> None:
-    parameters = ActuatorParameters.default()
+    parameters = ActuatorParameters.of(ALIENGO)
     still = DryGear(slip=ZERO, stick=ZERO)
     drives = HiddenDrives(parameters, still, DT, seed=0)
     torque = [drives.step(ZERO, ZERO, ZERO, 30.0, 0.5) for _ in range(2000)]

@@ -17,8 +17,9 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 import quadvel_dds
-from quadvel_description.robot import ALIENGO, KD, KP, NOMINAL_Q
+from quadvel_description.robot import KD, KP, NOMINAL_Q
 from quadvel_policy.observation import PolicyMetadata, default_observation
+from tests.helpers.robots import ALIENGO
 
 sys.path.insert(0, str(Path(__file__).parent))  # for `rig`
 quadvel_dds.install()  # before a test module imports rclpy

@@ -8,7 +8,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from quadvel_description.robot import ALIENGO, LIE_Q
+from quadvel_description.robot import LIE_Q
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_nodes.parameters import make_record
 from quadvel_policy.config import SupervisorConfig
@@ -16,6 +16,7 @@ from quadvel_policy.guard import Guard
 from quadvel_policy.guards import GUARDS
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import TickInput
+from tests.helpers.robots import ALIENGO
 
 PERIOD = 0.005
 STILL = (0.0, 0.0, 0.0, 1.0)

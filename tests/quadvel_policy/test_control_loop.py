@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from quadvel_description.robot import ALIENGO
 from quadvel_policy.control_loop import ControlConfig, ControlLoop
 from quadvel_policy.supervisor import Supervisor
+from tests.helpers.robots import ALIENGO
 
 
 class Clocks:

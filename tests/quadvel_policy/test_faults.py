@@ -23,6 +23,7 @@ from quadvel_policy.guards import GUARDS
 from quadvel_policy.guards.legs import EncoderInconsistent
 from quadvel_policy.supervisor import SUPERVISOR_FAULTS
 from quadvel_policy.tick_input import MotorStatus, TickInput
+from tests.helpers.robots import ALIENGO
 
 Changes = dict[str, Any]
 """Changes of the state of one tick, its age, or the time since the previous one"""
@@ -439,7 +440,7 @@ def check_limit(policy: Any, name: str) -> None:
         assert (np.abs(torque) <= TORQUE_LIMIT + 1e-9).all()
         assert power <= 1800.0 + 1e-6
         assert not ((np.abs(rig.seen.dq) > VELOCITY_LIMIT) & (torque * rig.seen.dq > 1e-9)).any()
-        assert (command.q >= command_limits.clip_to_command_range(command.q) - 1e-12).all()
+        assert (command.q >= command_limits.clip_to_command_range(ALIENGO, command.q) - 1e-12).all()
         if k:
             assert command.mode == before.mode
             assert np.abs(torque - asked_torque(before, rig)).max() <= 30.0 + 1e-9

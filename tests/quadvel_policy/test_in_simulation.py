@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from quadvel_description import mjcf
-from quadvel_description.robot import ALIENGO, KP, LIE_Q, NOMINAL_HEIGHT, NOMINAL_Q
+from quadvel_description.robot import KP, LIE_Q, NOMINAL_HEIGHT, NOMINAL_Q
 from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import TickInput
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.terrain import Terrain
+from tests.helpers.robots import ALIENGO
 
 STILL, STEP_IN_PLACE = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.1, 0.0)
 
@@ -27,9 +28,9 @@ class Stand:
         self, make_policy: Any, slope: float = 0.0, heading: float = 0.0, auto_stand: bool = True
     ) -> None:
         """slope, heading: rad; where the heading is zero the robot looks uphill."""
-        sag = mjcf.gravity_torque(mjcf.load_model(mjcf.Plant())) / KP
+        sag = mjcf.gravity_torque(mjcf.load_model(ALIENGO)) / KP
         terrain = Terrain("slope", slope=slope)
-        self.simulator = Simulator(SimulatorConfig(terrain=terrain))
+        self.simulator = Simulator(SimulatorConfig(robot=ALIENGO, terrain=terrain))
         turned = np.array([np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2)])
         quaternion = np.zeros(4)
         mujoco.mju_mulQuat(quaternion, terrain.tilt, turned)

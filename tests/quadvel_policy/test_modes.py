@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from quadvel_description.kinematics import foot_positions, rotate
-from quadvel_description.robot import ALIENGO, LIE_Q, NOMINAL_Q
+from quadvel_description.robot import LIE_Q, NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_policy.modes import ModeInput, Posture, blend, vertical_offset
+from tests.helpers.robots import ALIENGO
 
 
 def torque(command: JointCommand, q: np.ndarray, dq: np.ndarray) -> np.ndarray:

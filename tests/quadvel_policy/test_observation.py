@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import ALIENGO, NOMINAL_Q
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.symmetry import mirror_observation
 from quadvel_policy.observation import (
     ActionMap,
@@ -19,6 +19,7 @@ from quadvel_policy.observation import (
     build_observation,
     default_observation,
 )
+from tests.helpers.robots import ALIENGO
 
 VALUES: dict[str, Any] = {
     "command": [0.5, -0.2, 0.8, 0.0],

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from quadvel_description.robot import ALIENGO, NOMINAL_Q
+from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_policy.operator_log import OperatorLog
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import TickInput
+from tests.helpers.robots import ALIENGO
 
 STILL, FORWARD = (0.0, 0.0, 0.0, 1.0), (0.5, 0.0, 0.0, 0.0)
 

@@ -12,9 +12,9 @@ import pytest
 
 from quadvel_description.ahead import split_network
 from quadvel_description.network_file import NetworkFileError, read_network
-from quadvel_description.robot import ALIENGO
 from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from tests.helpers.robots import ALIENGO
 
 WritePolicy = Callable[..., Path]
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rig import FORWARD, STILL, Rig, assert_damping
 
-from quadvel_description.robot import ALIENGO, COMMAND_UPPER, LIE_Q, NOMINAL_Q, TORQUE_LIMIT, UPPER
+from quadvel_description.robot import COMMAND_UPPER, LIE_Q, NOMINAL_Q, TORQUE_LIMIT, UPPER
 from quadvel_description.state import MODE_SERVO
 from quadvel_nodes.parameters import make_record, parameter_fields
 from quadvel_policy.config import SupervisorConfig
@@ -22,6 +22,7 @@ from quadvel_policy.guards.legs import EncoderInconsistent
 from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.transitions import MODES
+from tests.helpers.robots import ALIENGO
 
 WITHOUT_ENCODERS = [guard for guard in GUARDS if guard is not EncoderInconsistent]
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from quadvel_description.kinematics import roll_pitch
-from quadvel_description.robot import ALIENGO, NOMINAL_Q
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
 from quadvel_driver.board_state import BoardState
@@ -24,6 +23,7 @@ from quadvel_sim.board import Board, BoardError
 from quadvel_sim.simulator import Simulator
 from quadvel_sim.udp_board import UdpBoard
 from tests.helpers.boards import running, wait_for
+from tests.helpers.robots import ALIENGO
 
 Wait = Callable[[Callable[[], object]], None]
 
@@ -54,7 +54,7 @@ def link() -> Iterator[Callable[[Board], tuple[Link, list[BoardState]]]]:
         def hold(state: BoardState) -> None:
             states.append(state)
             gains = {"kp": np.full(12, 150.0), "kd": np.full(12, 4.0)}
-            made.submit(JointCommand(q=np.array(NOMINAL_Q), tick=state.robot.tick, **gains))
+            made.submit(JointCommand(q=np.array(ALIENGO.nominal_q), tick=state.robot.tick, **gains))
 
         made = Link(ALIENGO, wire, UdpTransport(config), config, hold, calibration)
         thread = threading.Thread(target=made.run)
@@ -76,7 +76,7 @@ def test_the_real_link_holds_the_simulated_robot_up(serve: Serve, link: Connect)
     _, states = link(board)
     wait_for(lambda: len(states) > 300, board)
     robot = states[-1].robot
-    np.testing.assert_allclose(robot.q, NOMINAL_Q, atol=0.15)
+    np.testing.assert_allclose(robot.q, ALIENGO.nominal_q, atol=0.15)
     assert robot.linear_acceleration[2] == pytest.approx(9.81, abs=2.0)
     assert (states[-1].motor_mode == 10).all()
     assert not board.loop.simulator.fallen
@@ -89,7 +89,7 @@ def test_a_robot_whose_sensors_are_off_is_set_right_by_its_calibration(serve: Se
     _, states = link(board, off)
     wait_for(lambda: len(states) > 500, board)
     robot, truth = states[-1].robot, board.loop.simulator
-    np.testing.assert_allclose(truth.data.qpos[7:], NOMINAL_Q, atol=0.12)
+    np.testing.assert_allclose(truth.data.qpos[7:], ALIENGO.nominal_q, atol=0.12)
     np.testing.assert_allclose(robot.q, truth.data.qpos[7:], atol=0.02)
     assert np.abs(roll_pitch(robot.quaternion) - roll_pitch(truth.data.qpos[3:7])).max() < 0.01
 
@@ -116,7 +116,9 @@ def test_a_network_that_does_everything_wrong_does_not_let_it_fall(serve: Serve,
 
 def test_it_reports_the_mode_that_each_motor_was_asked_for(serve: Serve) -> None:
     board = serve()
-    packet = bytearray(wire.encode_command(JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, 150.0))))
+    packet = bytearray(
+        wire.encode_command(JointCommand(q=np.array(ALIENGO.nominal_q), kp=np.full(12, 150.0)))
+    )
     packet[10 + 27 * 4] = 0
     packet[-4:] = wire.crc(bytes(packet[:604])).to_bytes(4, "little")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
@@ -150,7 +152,7 @@ def test_the_drives_brake_by_themselves_once_the_link_is_gone(serve: Serve) -> N
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.connect(board.address)
         client.settimeout(20.0)
-        client.send(wire.encode_command(JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, 150.0))))
+        client.send(wire.encode_command(JointCommand(q=np.array(ALIENGO.nominal_q), kp=np.full(12, 150.0))))
         modes = [int(wire.decode_state(client.recv(2048)).motor_mode[0])]
         while modes[-1] != 10:
             modes.append(int(wire.decode_state(client.recv(2048)).motor_mode[0]))

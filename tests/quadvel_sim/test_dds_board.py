@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_description.robot import NOMINAL_Q, load_robot
 from quadvel_description.state import JointCommand
 from quadvel_driver.board_state import BoardState
 from quadvel_driver.link import Link, LinkConfig, LinkError
@@ -33,13 +32,12 @@ from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.dds_board import DdsBoard
 from quadvel_sim.simulator import Simulator
 from tests.helpers import boards
-
-GO2 = load_robot("go2")
+from tests.helpers.robots import ALIENGO, GO2
 
 DOMAIN, INTERFACE = int(os.environ["ROS_DOMAIN_ID"]), "lo"
 PATIENCE_S = 40.0
 VENDOR_CLIENT = Path(__file__).with_name("vendor_client.py")
-TARGET = np.array(NOMINAL_Q) + np.where(np.arange(12) == 3, 0.2, 0.0)  # the hip FL moves outward
+TARGET = np.array(ALIENGO.nominal_q) + np.where(np.arange(12) == 3, 0.2, 0.0)  # the hip FL moves outward
 
 
 wait_for = partial(boards.wait_for, patience=PATIENCE_S)
@@ -52,7 +50,7 @@ def serve() -> Iterator[Callable[..., DdsBoard]]:
 
         def begin(**network: float) -> DdsBoard:
             board = DdsBoard(Bus(DOMAIN, INTERFACE), NetworkConfig(**network))
-            simulator = Simulator(SimulatorConfig(suspended=True, watchdog=0.5))
+            simulator = Simulator(SimulatorConfig(robot=ALIENGO, suspended=True, watchdog=0.5))
             ends.enter_context(boards.running(board, simulator))
             return board
 
@@ -215,7 +213,7 @@ def test_the_vendors_client_reads_states_releases_the_controller_and_moves_a_joi
     board = serve()
     client = vendor()
     state = client.says()
-    np.testing.assert_allclose(state["q"], NOMINAL_Q, atol=0.2)
+    np.testing.assert_allclose(state["q"], ALIENGO.nominal_q, atol=0.2)
     assert (state["crc"], state["soc"]) == (0, 90)
     wait_for(lambda: board.counts["held"], board)
     assert board.counts["commands"] == 0

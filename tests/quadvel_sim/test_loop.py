@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from quadvel_actuator import ActuatorParameters
-from quadvel_description import robot
 from quadvel_description.state import MODE_SERVO, JointCommand, RobotState
 from quadvel_sim.loop import SimulationLoop
 from quadvel_sim.simulator import SensorNoise, Simulator, SimulatorConfig
+from tests.helpers.robots import ALIENGO
 
 
 class Clock:
@@ -28,7 +28,9 @@ class Bench:
     """A loop with a clock of the test's own, and what it published."""
 
     def __init__(self, mode: str, period: int = 5, **fields: object) -> None:
-        config = SimulatorConfig(noise=SensorNoise.none(), actuator=ActuatorParameters.ideal(), armature=1e9)
+        config = SimulatorConfig(
+            robot=ALIENGO, noise=SensorNoise.none(), actuator=ActuatorParameters.ideal(ALIENGO), armature=1e9
+        )
         self.clock = Clock()
         self.samples: list[tuple[RobotState, float]] = []
         self.waiting: list[tuple[int, float]] = []
@@ -43,7 +45,7 @@ class Bench:
 
 
 def command(torque: float, tick: int, mode: int = MODE_SERVO) -> JointCommand:
-    return JointCommand(q=robot.LIE_Q, tau=np.full(12, torque), tick=tick, mode=mode)
+    return JointCommand(q=ALIENGO.lie_q, tau=np.full(12, torque), tick=tick, mode=mode)
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
@@ -305,7 +307,7 @@ def test_a_reset_puts_the_robot_back_while_its_clock_goes_on() -> None:
     bench.loop.reset("stand")
     state, instant = bench.samples[-1]
     assert (state.tick, state.time, instant) == (20, 0.02, 100.016)  # later than the sample before
-    np.testing.assert_array_equal(state.q, robot.NOMINAL_Q)
+    np.testing.assert_array_equal(state.q, ALIENGO.nominal_q)
     bench.loop.advance()
     assert bench.loop.simulator.braking  # what came before the reset is forgotten
     assert bench.samples[-1][0].tick == 25

@@ -9,6 +9,7 @@ from quadvel_actuator import ActuatorParameters
 from quadvel_sim.parameters import SimParameters
 from quadvel_sim.simulator import SensorNoise
 from quadvel_sim.terrain import Terrain
+from tests.helpers.robots import ALIENGO
 
 
 def test_by_default_they_are_the_nominal_robot() -> None:
@@ -16,7 +17,7 @@ def test_by_default_they_are_the_nominal_robot() -> None:
     assert (config.terrain, config.noise, config.actuator) == (
         Terrain(),
         SensorNoise(),
-        ActuatorParameters.default(),
+        ActuatorParameters.of(ALIENGO),
     )
     np.testing.assert_array_equal(config.friction, 0.8)
     assert SimParameters().period == 5
@@ -24,7 +25,7 @@ def test_by_default_they_are_the_nominal_robot() -> None:
 
 def test_each_reaches_the_record_that_it_belongs_to(tmp_path: Path) -> None:
     file = tmp_path / "actuator.yaml"
-    ActuatorParameters.ideal().save(file)
+    ActuatorParameters.ideal(ALIENGO).save(file)
     config = SimParameters(
         seed=4,
         actuator_file=str(file),
@@ -47,7 +48,7 @@ def test_each_reaches_the_record_that_it_belongs_to(tmp_path: Path) -> None:
     ).config()
     assert config.terrain == Terrain("rough", slope=0.1, roughness=0.03, wavelength=0.8, seed=9)
     assert config.noise == SensorNoise(0.0, 0.1, 0.2, 0.3, 0.4)
-    assert config.actuator == ActuatorParameters.ideal()
+    assert config.actuator == ActuatorParameters.ideal(ALIENGO)
     assert (config.seed, config.payload, config.watchdog, config.watchdog_kd) == (4, 2.0, 0.05, 2.0)
     assert config.suspended
     np.testing.assert_array_equal(config.friction, 0.5)

@@ -8,10 +8,11 @@ import pytest
 
 from quadvel_sim.physics import HELD_OUT_PHYSICS, Physics
 from quadvel_sim.simulator import Simulator, SimulatorConfig
+from tests.helpers.robots import ALIENGO
 
 
 def test_time_and_weight_are_right_at_any_number_of_steps_a_millisecond() -> None:
-    simulator = Simulator(SimulatorConfig(physics=HELD_OUT_PHYSICS))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, physics=HELD_OUT_PHYSICS))
     simulator.reset("lie")
     simulator.step(1000)
     assert simulator.data.time == pytest.approx(1.0)
@@ -28,7 +29,7 @@ def test_time_and_weight_are_right_at_any_number_of_steps_a_millisecond() -> Non
 
 def test_the_usual_plant_is_what_the_model_says() -> None:
     runs = []
-    for config in (SimulatorConfig(), SimulatorConfig(physics=Physics())):
+    for config in (SimulatorConfig(robot=ALIENGO), SimulatorConfig(robot=ALIENGO, physics=Physics())):
         simulator = Simulator(config)
         simulator.step(200)
         runs.append(simulator.data.qpos.copy())

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import Vector3, Wrench
 
-from quadvel_description import robot
 from quadvel_description.quadruped import GRAVITY, JOINT_NAMES
 from quadvel_description.state import JointCommand
 from quadvel_nodes.messages import seconds
+from tests.helpers.robots import ALIENGO
 
 Start = Callable[..., Any]
 
 
 def hold(tick: int) -> JointCommand:
-    return JointCommand(q=robot.NOMINAL_Q, kp=np.full(12, 150.0), kd=np.full(12, 4.0), tick=tick)
+    return JointCommand(q=ALIENGO.nominal_q, kp=np.full(12, 150.0), kd=np.full(12, 4.0), tick=tick)
 
 
 def answer(state: Any) -> JointCommand:
@@ -40,10 +40,10 @@ def test_lockstep_waits_for_answers_and_tells_the_time(start: Start, peer: Any) 
         assert seconds(state.stamp) == pytest.approx(1e-3 * state.tick)
     stamps = {(s.stamp.sec, s.stamp.nanosec) for s in states[:101]}
     peer.spin_until(lambda: stamps <= {(m.clock.sec, m.clock.nanosec) for m in peer.heard["/clock"]})
-    np.testing.assert_allclose(states[100].q, robot.NOMINAL_Q, atol=0.1)
+    np.testing.assert_allclose(states[100].q, ALIENGO.nominal_q, atol=0.1)
     odom = peer.heard["ground_truth/odom"][-1]
     assert (odom.header.frame_id, odom.child_frame_id) == ("odom", "base_link")
-    assert odom.pose.pose.position.z == pytest.approx(robot.NOMINAL_HEIGHT, abs=0.03)
+    assert odom.pose.pose.position.z == pytest.approx(ALIENGO.nominal_height, abs=0.03)
     joints = peer.heard["joint_states"][-1]
     assert list(joints.name) == list(JOINT_NAMES)
     assert len(joints.position) == len(joints.velocity) == len(joints.effort) == 12
@@ -104,7 +104,7 @@ def test_the_services_reset_pause_step_and_push(start: Start, peer: Any) -> None
     assert peer.call("pause", data=True).success
     peer.spin(0.2)
     count, tick = len(states), states[-1].tick
-    force = Wrench(force=Vector3(x=0.0, y=0.0, z=40.0 * robot.MASS * GRAVITY))
+    force = Wrench(force=Vector3(x=0.0, y=0.0, z=40.0 * ALIENGO.mass * GRAVITY))
     assert peer.call("push", wrench=force, duration=0.01).success
     peer.answer = answer
     assert peer.call("step", steps=12).success

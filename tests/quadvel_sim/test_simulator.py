@@ -9,27 +9,26 @@ import numpy as np
 import pytest
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
-from quadvel_description import robot
 from quadvel_description.kinematics import foot_positions, rotate, rotate_inverse
 from quadvel_description.mjcf import gravity_torque
 from quadvel_description.quadruped import GRAVITY, LEGS
-from quadvel_description.robot import ALIENGO
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_sim.simulator import DT, SensorNoise, Simulator, SimulatorConfig
 from quadvel_sim.terrain import Terrain
+from tests.helpers.robots import ALIENGO
 
 G = GRAVITY
 
 
 def simulator(**fields: object) -> Simulator:
     """Noise-free sensors and, by default, ideal drives."""
-    defaults: dict[str, object] = {"noise": SensorNoise.none(), "actuator": ActuatorParameters.ideal()}
-    return Simulator(SimulatorConfig(**{**defaults, **fields}))
+    defaults: dict[str, object] = {"noise": SensorNoise.none(), "actuator": ActuatorParameters.ideal(ALIENGO)}
+    return Simulator(SimulatorConfig(robot=ALIENGO, **{**defaults, **fields}))
 
 
 def hold(kp: float = 150.0, kd: float = 4.0, q: np.ndarray | None = None, **fields: object) -> JointCommand:
     """A posture, the nominal one where `q` is None."""
-    q = robot.NOMINAL_Q if q is None else q
+    q = ALIENGO.nominal_q if q is None else q
     return JointCommand(q=q, kp=np.full(12, kp), kd=np.full(12, kd), **fields)
 
 
@@ -48,7 +47,7 @@ def run(sim: Simulator, command: JointCommand, seconds: float) -> None:
 def wiggle(sim: Simulator, k: int) -> JointCommand:
     """A smooth motion of all joints."""
     phase = 2.0 * np.pi * 3.0 * k * DT + np.arange(12)
-    return hold(60.0, 1.0, robot.NOMINAL_Q + 0.3 * np.sin(phase))
+    return hold(60.0, 1.0, ALIENGO.nominal_q + 0.3 * np.sin(phase))
 
 
 def momentum(sim: Simulator) -> np.ndarray:
@@ -69,7 +68,7 @@ def test_a_dropped_robot_falls_as_galilei_says() -> None:
     run(sim, hold(), 0.5)
     centre = sim.data.subtree_com[1].copy()
     end = sim.truth()
-    np.testing.assert_allclose(momentum(sim), [0.0, 0.0, -robot.MASS * G * 0.5], atol=1e-6)
+    np.testing.assert_allclose(momentum(sim), [0.0, 0.0, -ALIENGO.mass * G * 0.5], atol=1e-6)
     # semi-implicit Euler falls by half a step's worth of speed more
     drop = 0.5 * G * 0.5**2 + 0.5 * G * 0.5 * DT
     assert start.position[2] - end.position[2] == pytest.approx(drop, abs=2e-3)  # legs swing a little
@@ -97,7 +96,7 @@ def test_a_push_gives_its_impulse(body: str) -> None:
     sim.push(body, [0.0, 10.0, 0.0], duration=0.05)
     run(sim, hold(), 0.3)
     expected = 0.1 * np.array([60.0, -20.0, 30.0]) + 0.05 * np.array([0.0, 10.0, 0.0])
-    np.testing.assert_allclose(momentum(sim), expected - [0.0, 0.0, robot.MASS * G * 0.3], atol=0.01)
+    np.testing.assert_allclose(momentum(sim), expected - [0.0, 0.0, ALIENGO.mass * G * 0.3], atol=0.01)
     assert not sim.data.xfrc_applied.any()
 
 
@@ -120,7 +119,7 @@ def test_a_failed_drive_has_no_torque_and_measures_none_until_the_reset() -> Non
         sim.step()
         assert sim.data.ctrl[4] == 0.0
         assert sim.state().tau[4] == 0.0
-    assert abs(sim.state().q[4] - robot.NOMINAL_Q[4]) > 0.05  # the leg gives way
+    assert abs(sim.state().q[4] - ALIENGO.nominal_q[4]) > 0.05  # the leg gives way
     assert abs(sim.state().tau[5]) > 0.1
     sim.reset("stand")
     run(sim, hold(), 0.1)
@@ -134,8 +133,8 @@ def test_a_jammed_joint_hardly_moves_until_the_reset() -> None:
         sim.reset("stand")
         if jammed:
             sim.jam_joint("RR_calf_joint")
-        run(sim, hold(q=robot.NOMINAL_Q + 0.3), 0.04)
-        moved.append(sim.state().q - robot.NOMINAL_Q)
+        run(sim, hold(q=ALIENGO.nominal_q + 0.3), 0.04)
+        moved.append(sim.state().q - ALIENGO.nominal_q)
     assert moved[0][8] < 0.3 * moved[1][8]
     np.testing.assert_allclose(np.delete(moved[0], 8), np.delete(moved[1], 8), atol=0.02)
 
@@ -157,36 +156,38 @@ def test_reset_puts_the_robot_at_rest_with_its_feet_on_the_ground(keyframe: str)
     assert (sim.time, state.time, state.tick, sim.braking) == (0.0, 0.0, 0, True)
     np.testing.assert_array_equal(state.dq, 0.0)
     feet = truth.position + foot_positions(ALIENGO, state.q)
-    np.testing.assert_allclose(feet[:, 2], robot.FOOT_RADIUS, atol=2e-3)
+    np.testing.assert_allclose(feet[:, 2], ALIENGO.foot_radius, atol=2e-3)
     assert not sim.data.xfrc_applied.any()
 
 
 def test_a_held_posture_with_gravity_fed_forward_keeps_its_height() -> None:
-    sim = simulator(actuator=ActuatorParameters.default())
+    sim = simulator(actuator=ActuatorParameters.of(ALIENGO))
     sim.reset("stand")
     run(sim, hold(tau=gravity_torque(sim.model)), 1.0)
     truth = sim.truth()
-    assert truth.position[2] == pytest.approx(robot.NOMINAL_HEIGHT, abs=0.005)
+    assert truth.position[2] == pytest.approx(ALIENGO.nominal_height, abs=0.005)
     assert truth.contact.all()
-    assert truth.contact_force.sum(axis=0) == pytest.approx([0.0, 0.0, robot.MASS * G], abs=12.0)
+    assert truth.contact_force.sum(axis=0) == pytest.approx([0.0, 0.0, ALIENGO.mass * G], abs=12.0)
     assert not sim.fallen
 
 
 def test_a_payload_adds_its_weight_and_moves_the_centre_of_mass() -> None:
     bare, laden = simulator(), simulator(payload=5.0, payload_position=(0.2, 0.0, 0.1))
-    assert laden.model.body_subtreemass[1] == pytest.approx(robot.MASS + 5.0)
+    assert laden.model.body_subtreemass[1] == pytest.approx(ALIENGO.mass + 5.0)
     for sim in (bare, laden):
         sim.reset("stand")
         sim.state()
-    moment = robot.MASS * bare.data.subtree_com[1] + 5.0 * np.array([0.2, 0.0, robot.NOMINAL_HEIGHT + 0.1])
-    np.testing.assert_allclose(laden.data.subtree_com[1], moment / (robot.MASS + 5.0), atol=1e-9)
+    moment = ALIENGO.mass * bare.data.subtree_com[1] + 5.0 * np.array(
+        [0.2, 0.0, ALIENGO.nominal_height + 0.1]
+    )
+    np.testing.assert_allclose(laden.data.subtree_com[1], moment / (ALIENGO.mass + 5.0), atol=1e-9)
 
 
 def test_a_negative_payload_is_taken_off_the_trunk_and_leaves_its_centre_of_mass() -> None:
     bare, light = simulator(), simulator(payload=-2.0)
     trunk = bare.model.body("trunk").id
     share = 1.0 - 2.0 / bare.model.body_mass[trunk]
-    assert light.model.body_subtreemass[1] == pytest.approx(robot.MASS - 2.0)
+    assert light.model.body_subtreemass[1] == pytest.approx(ALIENGO.mass - 2.0)
     np.testing.assert_allclose(light.model.body_inertia[trunk], share * bare.model.body_inertia[trunk])
     np.testing.assert_allclose(light.model.body_ipos[trunk], bare.model.body_ipos[trunk])
 
@@ -233,7 +234,7 @@ def test_the_robot_stands_along_the_slope_on_its_ground(terrain: Terrain) -> Non
     assert up @ ground_up > np.cos(0.03)
     feet = truth.position + rotate(truth.quaternion, foot_positions(ALIENGO, state.q))
     gaps = (feet[:, 2] - terrain.height(feet[:, 0], feet[:, 1])) * np.cos(terrain.slope)
-    np.testing.assert_allclose(gaps, robot.FOOT_RADIUS, atol=2e-3)
+    np.testing.assert_allclose(gaps, ALIENGO.foot_radius, atol=2e-3)
     assert truth.contact.all()
     # what the sensor calls normal force is across the ground
     np.testing.assert_allclose(truth.contact_force @ ground_up, state.foot_force, rtol=0.05)
@@ -256,26 +257,26 @@ def test_fallen_means_belly_on_the_ground_or_too_much_tilt() -> None:
 
 
 def test_a_joint_at_rest_gets_the_torque_of_the_deviating_gains() -> None:
-    parameters = attrs.evolve(ActuatorParameters.default(), torque_noise=0.0)
+    parameters = attrs.evolve(ActuatorParameters.of(ALIENGO), torque_noise=0.0)
     sim = simulator(actuator=parameters, armature=1e9)  # nothing moves
     sim.reset("stand")
-    command = hold(20.0, 0.5, robot.NOMINAL_Q + 0.1, tau=np.full(12, 0.3))
+    command = hold(20.0, 0.5, ALIENGO.nominal_q + 0.1, tau=np.full(12, 0.3))
     run(sim, command, 0.1)
     state = sim.state()
     np.testing.assert_allclose(state.tau, 20.0 * (1.0 - 0.706 / 30.0) * 0.1 + 0.3, atol=1e-6)
 
 
 def test_the_drives_follow_the_actuator_model_on_each_millisecond_whenever_commands_come() -> None:
-    sim = simulator(actuator=ActuatorParameters.default(), seed=4)
+    sim = simulator(actuator=ActuatorParameters.of(ALIENGO), seed=4)
     seeds = np.random.SeedSequence(4).generate_state(2)
-    model = ActuatorModel(ActuatorParameters.default(), dt=DT, seed=int(seeds[0]))
+    model = ActuatorModel(ActuatorParameters.of(ALIENGO), dt=DT, seed=int(seeds[0]))
     sim.reset("stand")
     rng = np.random.default_rng(0)
     braking = JointCommand.damping(sim.config.watchdog_kd)
     command, next_command = braking, 4
     for k in range(200):
         if k == next_command:
-            command = hold(30.0, 0.5, robot.NOMINAL_Q + 0.1 * rng.normal(size=12))
+            command = hold(30.0, 0.5, ALIENGO.nominal_q + 0.1 * rng.normal(size=12))
             sim.command(command)
             next_command += int(rng.integers(1, 15))
         state = sim.state()
@@ -288,7 +289,7 @@ def test_a_command_counts_from_the_instant_at_which_it_is_given() -> None:
     sim = simulator(armature=1e9)
     sim.reset("stand")
     sim.state()
-    sim.command(hold(10.0, 0.0, robot.NOMINAL_Q + 0.2))
+    sim.command(hold(10.0, 0.0, ALIENGO.nominal_q + 0.2))
     sim.step(1)
     np.testing.assert_allclose(sim.data.qfrc_actuator[6:], 2.0, atol=1e-9)
 
@@ -296,11 +297,11 @@ def test_a_command_counts_from_the_instant_at_which_it_is_given() -> None:
 def test_without_commands_the_drives_brake_after_the_watchdog_time_and_not_before() -> None:
     sim = simulator(watchdog=0.02, watchdog_kd=3.0)
     fly(sim)
-    sim.command(hold(20.0, 0.0, robot.NOMINAL_Q + 0.3))
+    sim.command(hold(20.0, 0.0, ALIENGO.nominal_q + 0.3))
     for k in range(25):
         assert sim.braking == (k >= 20)
         q, dq = sim.data.qpos[7:].copy(), sim.data.qvel[6:].copy()
-        expected = -3.0 * dq if k >= 20 else 20.0 * (robot.NOMINAL_Q + 0.3 - q)
+        expected = -3.0 * dq if k >= 20 else 20.0 * (ALIENGO.nominal_q + 0.3 - q)
         np.testing.assert_allclose(sim.state().tau, expected, atol=1e-9)
         sim.step()
         np.testing.assert_allclose(sim.data.qfrc_actuator[6:], expected, atol=1e-9)
@@ -313,12 +314,12 @@ def test_damping_mode_ignores_stiffness_and_feedforward() -> None:
     sim = simulator()
     fly(sim)
     sim.data.qvel[6:] = 1.0
-    sim.command(hold(50.0, 2.0, robot.NOMINAL_Q + 0.3, tau=np.full(12, 5.0), mode=MODE_DAMPING))
+    sim.command(hold(50.0, 2.0, ALIENGO.nominal_q + 0.3, tau=np.full(12, 5.0), mode=MODE_DAMPING))
     np.testing.assert_allclose(sim.state().tau, -2.0, atol=1e-9)
 
 
 def test_a_braking_robot_sinks_slowly_and_comes_to_rest() -> None:
-    sim = simulator(actuator=ActuatorParameters.default())
+    sim = simulator(actuator=ActuatorParameters.of(ALIENGO))
     sim.reset("stand")
     speeds = []
     for _ in range(120):  # legs folded below it, it stays up for some seconds
@@ -407,7 +408,7 @@ def test_at_rest_the_imu_feels_gravity_upward_and_the_feet_the_weight() -> None:
     run(sim, hold(tau=gravity_torque(sim.model)), 1.0)
     state = sim.state()
     np.testing.assert_allclose(rotate(state.quaternion, state.linear_acceleration), [0.0, 0.0, G], atol=0.05)
-    assert state.foot_force.sum() == pytest.approx(robot.MASS * G, rel=0.01)
+    assert state.foot_force.sum() == pytest.approx(ALIENGO.mass * G, rel=0.01)
 
 
 def test_truth_is_the_motion_of_the_trunk_origin_in_the_body_frame() -> None:
@@ -447,7 +448,7 @@ def test_sensor_noise_has_its_standard_deviations_and_tau_and_truth_have_none() 
 def trace(sim: Simulator, read_every: int) -> np.ndarray:
     rows = []
     for k in range(60):
-        sim.command(hold(40.0, 1.0, robot.NOMINAL_Q + 0.1 * np.sin(0.1 * k)))
+        sim.command(hold(40.0, 1.0, ALIENGO.nominal_q + 0.1 * np.sin(0.1 * k)))
         for i in range(5):
             if read_every and (5 * k + i) % read_every == 0:
                 sim.state(), sim.truth(), sim.fallen
@@ -457,19 +458,19 @@ def trace(sim: Simulator, read_every: int) -> np.ndarray:
 
 
 def test_a_reset_gives_the_same_run_to_the_bit_however_often_it_is_read() -> None:
-    sim = Simulator(SimulatorConfig(seed=3))
+    sim = Simulator(SimulatorConfig(robot=ALIENGO, seed=3))
     sim.reset("stand")
     first = trace(sim, 0)
     for read_every in (1, 7):
         sim.reset("stand")
         np.testing.assert_array_equal(trace(sim, read_every), first)
-    other = Simulator(SimulatorConfig(seed=3))
+    other = Simulator(SimulatorConfig(robot=ALIENGO, seed=3))
     other.reset("stand")
     np.testing.assert_array_equal(trace(other, 5), first)
 
 
 def test_another_seed_gives_another_run_and_its_number_brings_it_back() -> None:
-    sim = Simulator(SimulatorConfig(seed=3))
+    sim = Simulator(SimulatorConfig(robot=ALIENGO, seed=3))
     runs = []
     for seed in (None, 8, 3, 8):
         sim.reset("stand", seed=seed)
@@ -497,7 +498,7 @@ def test_another_seed_gives_another_run_and_its_number_brings_it_back() -> None:
 )
 def test_a_bad_configuration_is_refused_by_name(fields: dict, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
-        SimulatorConfig(**fields)
+        SimulatorConfig(robot=ALIENGO, **fields)
 
 
 def test_bad_orders_are_refused_by_name() -> None:

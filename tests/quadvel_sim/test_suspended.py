@@ -5,13 +5,13 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from quadvel_description import robot
 from quadvel_description.state import JointCommand
 from quadvel_sim import SensorNoise, Simulator, SimulatorConfig, Terrain
+from tests.helpers.robots import ALIENGO
 
 
 def suspended_robot(**changes: object) -> Simulator:
-    simulator = Simulator(SimulatorConfig(suspended=True, noise=SensorNoise.none(), **changes))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, suspended=True, noise=SensorNoise.none(), **changes))
     simulator.reset("stand")
     return simulator
 
@@ -21,12 +21,12 @@ def test_the_trunk_stays_while_the_legs_swing() -> None:
     swing = np.tile([0.2, 0.4, -0.3], 4)
     feet = np.zeros(4, bool)
     for i in range(300):
-        target = robot.NOMINAL_Q + swing * np.sin(2 * np.pi * 3.0 * i * 0.001)
+        target = ALIENGO.nominal_q + swing * np.sin(2 * np.pi * 3.0 * i * 0.001)
         simulator.command(JointCommand(q=target, kp=np.full(12, 60.0), kd=np.full(12, 1.0)))
         simulator.step()
         feet |= simulator.truth().contact
     truth = simulator.truth()
-    np.testing.assert_allclose(truth.position, [0.0, 0.0, robot.SUSPENDED_HEIGHT], atol=2e-3)
+    np.testing.assert_allclose(truth.position, [0.0, 0.0, ALIENGO.suspended_height], atol=2e-3)
     np.testing.assert_allclose(truth.quaternion, [1.0, 0.0, 0.0, 0.0], atol=2e-3)
     assert not feet.any()
     assert not simulator.fallen
@@ -34,7 +34,7 @@ def test_the_trunk_stays_while_the_legs_swing() -> None:
 
 def test_at_rest_the_drives_hold_the_legs_weight_alone() -> None:
     simulator = suspended_robot(joint_friction=np.zeros(12))
-    command = JointCommand(q=np.array(robot.NOMINAL_Q), kp=np.full(12, 300.0), kd=np.full(12, 5.0))
+    command = JointCommand(q=np.array(ALIENGO.nominal_q), kp=np.full(12, 300.0), kd=np.full(12, 5.0))
     for _ in range(150):
         simulator.command(command)
         simulator.step(10)

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from quadvel_description import robot
 from quadvel_description.kinematics import rotate, yaw
-from quadvel_description.robot import ALIENGO
 from quadvel_description.state import MODE_SERVO, JointCommand
 from quadvel_eval.people.laser import FloorPlan
 from quadvel_eval.robot_loop import RobotLoop, TrueVelocity
@@ -26,6 +24,7 @@ from quadvel_sim.persons import Persons
 from quadvel_sim.simulator import build_model
 from quadvel_sim.world import SHIPPED_WORLDS
 from quadvel_sim.world_parts import Box, Hill, Patch, Person, Table, Trees, Wall
+from tests.helpers.robots import ALIENGO
 
 QUIET = {"noise": 0.0, "noise_share": 0.0, "lost": 0.0, "mixed": 0.0}
 AT_TRUNK = Laser(position=(0.0, 0.0, 0.0), field_of_view=360.0, rays=720, range_max=30.0, **QUIET)
@@ -33,7 +32,7 @@ AT_TRUNK = Laser(position=(0.0, 0.0, 0.0), field_of_view=360.0, rays=720, range_
 
 def standing(world: World, **config: Any) -> Simulator:
     """The robot in its nominal posture at the origin, time zero."""
-    simulator = Simulator(SimulatorConfig(world=world, **config))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, world=world, **config))
     simulator.reset("stand")
     return simulator
 
@@ -47,7 +46,7 @@ def turned(simulator: Simulator, x: float, z: float, quaternion: list[float]) ->
         linear_velocity=np.zeros(3),
         angular_velocity=np.zeros(3),
     )
-    simulator.set_state(truth, robot.NOMINAL_Q, np.zeros(12))
+    simulator.set_state(truth, ALIENGO.nominal_q, np.zeros(12))
 
 
 def about_y(angle: float) -> list[float]:
@@ -122,7 +121,7 @@ def test_readings_have_the_faults_that_were_asked_for() -> None:
 
 def seen_of(seed: int, look: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return last scan, people and the robot's state after 0.2 s in the corridor."""
-    simulator = Simulator(SimulatorConfig(world=World.load("corridor"), seed=seed))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, world=World.load("corridor"), seed=seed))
     for _ in range(4):
         if look:
             simulator.scan()
@@ -146,7 +145,7 @@ def test_persons_are_tracked_where_they_are() -> None:
     ]
     laser = Laser(field_of_view=180.0, rays=540)
     world = World(laser=laser, persons=persons, trees=[Trees(positions=[[4.0, 3.5], [3.0, -4.0]])])
-    simulator, tracker, errors = Simulator(SimulatorConfig(world=world)), PersonTracker(), []
+    simulator, tracker, errors = Simulator(SimulatorConfig(robot=ALIENGO, world=world)), PersonTracker(), []
     offset = world.laser.position
     for k in range(60):
         scan, truth = simulator.scan(), simulator.truth()
@@ -165,7 +164,7 @@ def test_persons_are_tracked_where_they_are() -> None:
 
 def test_a_person_waits_before_the_robot_and_goes_on_once_it_is_gone() -> None:
     world = World(persons=[Person(way=[[2.0, 0.0], [-4.0, 0.0]], speed=1.5)])
-    simulator = Simulator(SimulatorConfig(world=world))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, world=world))
     simulator.step(2000)
     x = simulator.persons()[0, 0]
     assert 0.4 + 0.45 < x < 0.4 + 0.51
@@ -186,7 +185,7 @@ def test_a_person_walks_rounds_with_its_stops_and_paces() -> None:
         turn=0.0,
     )
     world = World(persons=[person])
-    model = build_model(SimulatorConfig(world=world))
+    model = build_model(SimulatorConfig(robot=ALIENGO, world=world))
     data, persons = mujoco.MjData(model), Persons(model, world)
     persons.reset(data)
     seconds = 4 + 2 + 4 + 16 + 3  # to the stop, the stop, on, slowly, and three metres of the next round
@@ -216,7 +215,7 @@ def test_the_height_of_the_ground_is_where_a_vertical_ray_hits_it() -> None:
 def hold(simulator: Simulator, seconds: float) -> None:
     """Hold the nominal posture, firmly."""
     command = JointCommand(
-        q=robot.NOMINAL_Q,
+        q=ALIENGO.nominal_q,
         dq=np.zeros(12),
         tau=np.zeros(12),
         kp=np.full(12, 120.0),
@@ -232,12 +231,12 @@ def hold(simulator: Simulator, seconds: float) -> None:
 def on_slope(simulator: Simulator, degrees: float, x: float) -> None:
     """Put the robot onto a slope that rises along x from the origin."""
     slope = np.radians(degrees)
-    turned(simulator, x, x * np.tan(slope) + robot.NOMINAL_HEIGHT / np.cos(slope), about_y(-slope))
+    turned(simulator, x, x * np.tan(slope) + ALIENGO.nominal_height / np.cos(slope), about_y(-slope))
 
 
 def test_a_hill_carries_the_robot_as_an_endless_slope_does() -> None:
     hill = Hill(position=[10.0, 0.0], size=[20.0, 10.0], height=1.0, slope=15.0)
-    plane = Simulator(SimulatorConfig(terrain=Terrain("slope", slope=np.radians(15.0))))
+    plane = Simulator(SimulatorConfig(robot=ALIENGO, terrain=Terrain("slope", slope=np.radians(15.0))))
     found = []
     for simulator in (standing(World(hills=[hill])), plane):
         on_slope(simulator, 15.0, 1.8)
@@ -266,7 +265,7 @@ def test_a_patch_has_the_friction_of_its_surface_and_bumps_above_the_ground() ->
     for friction, bumps in ((0.9, 0.05), (0.1, 0.006)):
         patch = Patch(surface="grass", position=[0.0, 0.0], size=[6.0, 6.0], friction=friction, bumps=bumps)
         simulator = standing(World(patches=[patch]))
-        turned(simulator, 0.0, robot.NOMINAL_HEIGHT + bumps, about_y(0.0))
+        turned(simulator, 0.0, ALIENGO.nominal_height + bumps, about_y(0.0))
         hold(simulator, 0.5)
         contact = simulator.data.contact
         assert np.allclose(contact.friction[:, 0], friction)
@@ -277,7 +276,7 @@ def test_a_patch_has_the_friction_of_its_surface_and_bumps_above_the_ground() ->
 
 def test_what_the_robot_touches_is_counted_by_name_and_pushes_back() -> None:
     world = World(boxes=[Box(position=[0.3235 + 0.25 - 0.004, 0.0], size=[0.5, 0.5, 1.0])])
-    simulator = Simulator(SimulatorConfig(world=world))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, world=world))
     simulator.step(300)
     assert dict(simulator.touch_counts) == {"box_0": 1}
     assert simulator.truth().position[0] < -0.001
@@ -295,7 +294,7 @@ def test_without_a_world_there_is_no_scan_and_nobody() -> None:
 
 def test_a_world_brings_its_own_ground() -> None:
     with pytest.raises(ValueError, match=r"SimulatorConfig.terrain: found 'rough' in a world"):
-        SimulatorConfig(world=World(), terrain=Terrain("rough"))
+        SimulatorConfig(robot=ALIENGO, world=World(), terrain=Terrain("rough"))
 
 
 @pytest.mark.parametrize("name", SHIPPED_WORLDS)
@@ -317,7 +316,7 @@ def test_a_shipped_world_leads_a_person_who_walks_where_nothing_stands(name: str
     for trees in world.trees:
         gaps = np.linalg.norm(places[:, None] - trees.positions[None], axis=2) - trees.radius
         assert gaps.min() > 0.8
-    simulator = Simulator(SimulatorConfig(world=world))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, world=world))
     simulator.step(100)
     assert not simulator.touch_counts
     assert np.hypot(*simulator.persons()[0, :2]) < 2.5

@@ -5,6 +5,7 @@ import numpy as np
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters, DelayPair
 from quadvel_sysid.logs.log import Log
+from tests.helpers.robots import ALIENGO
 
 NAMES = tuple(f"{leg}_{part}_joint" for leg in ("FR", "FL", "RR", "RL") for part in ("hip", "thigh", "calf"))
 TABLE_4 = {
@@ -21,7 +22,7 @@ def parameters(effects=(), joints=12, **values):
     given = TABLE_4 | values
     pair = DelayPair(given["input_delay"], given["output_delay"], given["noise"])
     return attrs.evolve(
-        ActuatorParameters.default(),
+        ActuatorParameters.of(ALIENGO),
         delta_kp=given["delta_kp"],
         delta_kd=given["delta_kd"],
         pairs=(pair,),

@@ -9,9 +9,9 @@ import pytest
 
 from quadvel_description import robot
 from quadvel_description.kinematics import foot_positions
-from quadvel_description.robot import ALIENGO
 from quadvel_sysid import excitation
 from quadvel_sysid.excitation import EXCITATIONS, MAX_TORQUE_SHARE, PERIOD_S, FootLifting, propose
+from tests.helpers.robots import ALIENGO
 
 
 def eq9(t: float, leg: int) -> float:

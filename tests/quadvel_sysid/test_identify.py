@@ -15,6 +15,7 @@ from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.check_log import check_logs
 from quadvel_sysid.logs.excerpts import cut_excerpts
 from quadvel_sysid.options import IdentifyOptions
+from tests.helpers.robots import ALIENGO
 
 JOINTS = NAMES[:2]
 
@@ -117,7 +118,7 @@ def test_the_report_states_gains_of_each_joint_and_torques_above_the_limit():
     def weaker(k, q, dq, tau):
         return tau * np.array([1.0, 0.6])
 
-    base = attrs.evolve(ActuatorParameters.default(), torque_limit=2.0)
+    base = attrs.evolve(ActuatorParameters.of(ALIENGO), torque_limit=2.0)
     report = identify(
         [record(_truth(), 2, 3.0, 500, seed=4, distort=weaker)], options=IdentifyOptions(base=base)
     ).report

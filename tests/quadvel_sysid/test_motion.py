@@ -18,6 +18,7 @@ from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
 from quadvel_sysid.options import IdentifyOptions
+from tests.helpers.robots import ALIENGO
 
 JOINTS = NAMES[:2]
 
@@ -61,7 +62,12 @@ def _hung(friction, seconds=5.0, seed=0):
     noise = SensorNoise(q=1e-4, dq=0.01)
     simulator = Simulator(
         SimulatorConfig(
-            suspended=True, noise=noise, seed=seed, joint_friction=friction, joint_damping=np.full(12, 0.01)
+            robot=ALIENGO,
+            suspended=True,
+            noise=noise,
+            seed=seed,
+            joint_friction=friction,
+            joint_damping=np.full(12, 0.01),
         )
     )
     simulator.reset("stand", seed=seed)

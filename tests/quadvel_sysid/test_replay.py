@@ -15,9 +15,10 @@ from quadvel_sysid.export.replay import find_load
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.options import IdentifyOptions
+from tests.helpers.robots import ALIENGO
 
 CALF = ("FR_calf_joint",)
-IDEAL = attrs.evolve(ActuatorParameters.ideal(), torque_limit=45.0)
+IDEAL = attrs.evolve(ActuatorParameters.ideal(ALIENGO), torque_limit=45.0)
 
 
 def _still(joints=CALF, seconds=1.0, **fields):

@@ -15,6 +15,7 @@ import pytest
 from quadvel_actuator import ActuatorParameters
 from quadvel_sysid.report.identification import Identification, Shape, Trace
 from quadvel_sysid.report.report import REPORT_FILES, write_report
+from tests.helpers.robots import ALIENGO
 
 JOINTS = ["FR_hip_joint", "FR_thigh_joint", "FR_calf_joint"]
 DECISION = "Add stribeck_friction & a bound: the held-out error falls from 0.31 to 0.07 <N m>²."
@@ -113,7 +114,7 @@ def identification(**changes: Any) -> Identification:
     )
     return Identification(
         {**copy.deepcopy(REPORT), **changes},
-        ActuatorParameters.default(),
+        ActuatorParameters.of(ALIENGO),
         {JOINTS[2]: trace},
         (shape,),
     )
@@ -172,7 +173,7 @@ def test_three_files_are_written_and_nothing_else(folder: Path) -> None:
 
 def test_the_json_is_the_report_and_the_yaml_the_model(folder: Path) -> None:
     assert json.loads((folder / "report.json").read_text()) == REPORT
-    assert ActuatorParameters.load(folder / "actuator.yaml") == ActuatorParameters.default()
+    assert ActuatorParameters.load(folder / "actuator.yaml") == ActuatorParameters.of(ALIENGO)
 
 
 def test_the_page_is_well_formed_and_loads_nothing(page: Page) -> None:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import ALIENGO
 from quadvel_view.operator import Operator
 from quadvel_view.panel import panel
 from quadvel_view.picture import TOPICS, Ground, RobotPicture
+from tests.helpers.robots import ALIENGO
 
 from .conftest import message, odometry
 

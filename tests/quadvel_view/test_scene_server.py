@@ -18,11 +18,11 @@ from viser._tunnel import ViserTunnel
 from websockets.asyncio.client import unix_connect
 from websockets.typing import Subprotocol
 
-from quadvel_description.robot import ALIENGO
 from quadvel_view.access_control import is_loopback
 from quadvel_view.scene_server import SceneServer, SceneServerError, client_page
 from quadvel_view.server import AddressError
 from quadvel_view.viewer import Viewer
+from tests.helpers.robots import ALIENGO
 
 VISER = [Subprotocol(f"viser-v{viser.__version__}")]
 

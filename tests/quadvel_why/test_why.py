@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from quadvel_bringup import cli
-from quadvel_description.robot import ALIENGO
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import Diagnosis, diagnose
 from quadvel_why.links import CAUSES
@@ -19,6 +18,7 @@ from quadvel_why.page import page
 from quadvel_why.reading import read_run
 from quadvel_why.run import Commands, Run
 from quadvel_why.signals import PARTS, Signals
+from tests.helpers.robots import ALIENGO
 
 ORDER = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
 

@@ -10,7 +10,6 @@ import pytest
 
 onnx = pytest.importorskip("onnx", reason="model cards need onnx: pip install 'quadvel-core[train]'")
 
-from quadvel_description.robot import ALIENGO  # noqa: E402
 from quadvel_estimator.learned import SHIPPED_MODEL  # noqa: E402
 from quadvel_eval.grid import Cell, CellResult, summarise  # noqa: E402
 from quadvel_eval.segments import Segment  # noqa: E402
@@ -18,6 +17,7 @@ from quadvel_eval.walk import Setup  # noqa: E402
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile  # noqa: E402
 from quadvel_training import __main__ as main  # noqa: E402
 from quadvel_training.card import SECTIONS, card  # noqa: E402
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 
 @pytest.fixture

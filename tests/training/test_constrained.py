@@ -8,12 +8,12 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
-from quadvel_description.robot import ALIENGO  # noqa: E402
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import constrained, loop  # noqa: E402
 from quadvel_training.constrained import ConstrainedConfig, ConstrainedRun  # noqa: E402
 from quadvel_training.dagger import DaggerConfig, DaggerRun  # noqa: E402
 from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun  # noqa: E402
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 SMALL = ConstrainedConfig(n=8, threads=1, length=8, critic_first=0, pull_samples=1e4, constraint_samples=1e4)
 

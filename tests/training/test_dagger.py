@@ -8,12 +8,12 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
-from quadvel_description.robot import ALIENGO  # noqa: E402
 from quadvel_policy.observation import VelocityCommandLimits  # noqa: E402
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import dagger, loop  # noqa: E402
 from quadvel_training.dagger import DaggerConfig, DaggerRun  # noqa: E402
 from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun  # noqa: E402
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 SMALL = DaggerConfig(n=8, threads=1, length=6, mini_batches=2, learning_rate=3e-3)
 

@@ -10,7 +10,6 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
-from quadvel_description import robot  # noqa: E402
 from quadvel_description.kinematics import rotate  # noqa: E402
 from quadvel_description.quadruped import GRAVITY  # noqa: E402
 from quadvel_policy.command_mux import CommandMux, MuxConfig, MuxInput  # noqa: E402
@@ -21,15 +20,18 @@ from quadvel_training.env import RAMP_AXES, RAMP_DOWN, TICK_S, CommandRange, Env
 from quadvel_training.privileged import PrivilegedConfig  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
 from quadvel_training.rewards import RewardWeights, Table2  # noqa: E402
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 STANDING = CommandRange(stance=1.0, hold=(100.0, 100.0))
-QUIET = EnvConfig(n=4, threads=1, seed=3, randomisation=Randomisation.none(), commands=STANDING)
+QUIET = EnvConfig(
+    robot=ALIENGO, n=4, threads=1, seed=3, randomisation=Randomisation.none(), commands=STANDING
+)
 
 
 def stand(env):
     """A tick in which stiff joints hold the standing posture."""
     gains = np.ones((env.config.n, 12))
-    env.tick(np.tile(robot.NOMINAL_Q, (env.config.n, 1)), kp=150.0 * gains, kd=5.0 * gains)
+    env.tick(np.tile(ALIENGO.nominal_q, (env.config.n, 1)), kp=150.0 * gains, kd=5.0 * gains)
 
 
 def test_targets_beyond_the_range_push_as_the_whole_target_would():
@@ -40,8 +42,8 @@ def test_targets_beyond_the_range_push_as_the_whole_target_would():
         before = env.q
         env.tick(np.tile(target, (4, 1)))
     knees = slice(2, None, 3)
-    asked = robot.KP * (target - before)[:, knees]
-    within = robot.KP * (robot.COMMAND_UPPER - before)[:, knees]
+    asked = ALIENGO.kp * (target - before)[:, knees]
+    within = ALIENGO.kp * (ALIENGO.command_upper - before)[:, knees]
     assert (env.torque[:, knees] > 0.8 * asked).all()  # damped, and delayed by some ms
     assert (env.torque[:, knees] > 1.1 * within).all()
 
@@ -150,7 +152,7 @@ def test_lifting_feet_pays_only_while_walking_and_posture_counts_only_in_stance(
     env.contact = np.zeros((4, 4), bool)
     env.clearance = np.full((4, 4), 0.03)
     env.command[:] = [0.0, 0.0, 0.0, 1.0]
-    env.q = robot.NOMINAL_Q + np.linspace(-0.1, 0.2, 12) * np.ones((4, 1))
+    env.q = ALIENGO.nominal_q + np.linspace(-0.1, 0.2, 12) * np.ones((4, 1))
     assert table.terms(np.zeros((4, 12)))["posture"][0] == pytest.approx(
         -np.abs(np.linspace(-0.1, 0.2, 12)).sum()
     )
@@ -161,9 +163,9 @@ def test_lifting_feet_pays_only_while_walking_and_posture_counts_only_in_stance(
 
 
 def test_joints_nearly_as_fast_as_their_drives_are_fined():
-    env = VelocityEnv(EnvConfig(n=2, threads=1, randomisation=Randomisation.none()))
+    env = VelocityEnv(EnvConfig(robot=ALIENGO, n=2, threads=1, randomisation=Randomisation.none()))
     env.dq = np.zeros((2, 12))
-    env.dq[0, :6] = 0.89 * robot.VELOCITY_LIMIT[:6]
+    env.dq[0, :6] = 0.89 * ALIENGO.velocity_limit[:6]
     env.dq[1, 1], env.dq[1, 5] = 19.0, -15.301  # of 20 and 15.89 rad/s
     fine = Table2(env, RewardWeights()).terms(np.zeros((2, 12)))["overspeed"]
     assert fine == pytest.approx([0.0, -2.0])
@@ -231,9 +233,9 @@ def test_a_missing_checkpoint_is_named(tmp_path):
 @pytest.mark.parametrize("degrees", [0.0, 20.0, -20.0])
 def test_robots_start_with_four_feet_on_a_slope_whichever_way_they_look(degrees):
     slope = Terrain(kind="slope", slope=float(np.radians(degrees))) if degrees else Terrain()
-    config = EnvConfig(n=16, threads=1, terrain=slope, randomisation=Randomisation.none())
+    config = EnvConfig(robot=ALIENGO, n=16, threads=1, terrain=slope, randomisation=Randomisation.none())
     env = VelocityEnv(config)
-    env._qpos[:, 7:] = robot.NOMINAL_Q
+    env._qpos[:, 7:] = ALIENGO.nominal_q
     env._update_state()
     across = env.clearance * np.cos(np.radians(degrees))  # m, from the ground, at right angles to it
     assert np.ptp(across, axis=1).max() < 0.002

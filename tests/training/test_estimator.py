@@ -8,10 +8,8 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
-from quadvel_description import robot  # noqa: E402
 from quadvel_description.kinematics import rotation_matrix  # noqa: E402
 from quadvel_description.quadruped import GRAVITY  # noqa: E402
-from quadvel_description.robot import ALIENGO  # noqa: E402
 from quadvel_description.state import JointCommand, RobotState  # noqa: E402
 from quadvel_estimator import features  # noqa: E402
 from quadvel_estimator.kalman import KalmanConfig  # noqa: E402
@@ -25,6 +23,7 @@ from quadvel_training.estimator import EstimatorConfig, EstimatorRun, VelocityNe
 from quadvel_training.networks import Recurrent  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
 from quadvel_training.walks import Mode, Modes, Walks  # noqa: E402
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 STILL = CommandRange(stance=1.0)
 
@@ -44,21 +43,21 @@ def test_postures_are_those_of_the_controller(monkeypatch):
     """Targets and their speeds, tick by tick, while a robot stands up from any joint positions."""
     only(monkeypatch, Mode.DAMPING)
     rng = np.random.default_rng(0)
-    modes = Modes(1, rng)
+    modes = Modes(ALIENGO, 1, rng)
     modes.begin(np.array([0]))
-    q = robot.LIE_Q + rng.normal(0, 0.1, 12)
+    q = ALIENGO.lie_q + rng.normal(0, 0.1, 12)
     while modes.mode[0] == Mode.DAMPING:
-        modes.set_targets(np.zeros((1, 12)), robot.KP, robot.KD)
+        modes.set_targets(np.zeros((1, 12)), ALIENGO.kp, ALIENGO.kd)
         modes.advance(q[None])
     c = SupervisorConfig()
-    fold = Posture(ALIENGO, [(c.fold_time, robot.LIE_Q)], c.stand_kp, c.stand_kd)
+    fold = Posture(ALIENGO, [(c.fold_time, ALIENGO.lie_q)], c.stand_kp, c.stand_kd)
     state = RobotState(
         0.0, 0, q, np.zeros(12), np.zeros(12), np.array([1.0, 0, 0, 0]), *np.zeros((2, 3)), np.zeros(4)
     )
     fold.enter(ModeInput(0.0, state, None, np.zeros(4), JointCommand.damping(c.damping_kd)))
     for k in range(round(c.fold_time / TICK_S)):
         wanted = fold.tick(ModeInput(k * TICK_S, state, None, np.zeros(4), JointCommand.damping(1.0)))
-        speed = modes.set_targets(np.zeros((1, 12)), robot.KP, robot.KD)
+        speed = modes.set_targets(np.zeros((1, 12)), ALIENGO.kp, ALIENGO.kd)
         np.testing.assert_allclose(modes.target[0], wanted.q, atol=1e-9)
         np.testing.assert_allclose(speed[0], wanted.dq, atol=1e-9)
         assert (modes.kp == c.stand_kp).all()
@@ -69,38 +68,42 @@ def test_postures_are_those_of_the_controller(monkeypatch):
 
 def test_what_the_policy_asks_for_fades_in(monkeypatch):
     only(monkeypatch, Mode.STANCE)
-    modes = Modes(1, np.random.default_rng(0))
+    modes = Modes(ALIENGO, 1, np.random.default_rng(0))
     modes.begin(np.array([0]))
     c = SupervisorConfig()
     monkeypatch.setattr(walks, "LOWER_SHARE", 0.0)
     asked, q = np.full((1, 12), 0.3), np.zeros((1, 12))
     torque = []
     while modes.mode[0] == Mode.STANCE or modes.elapsed[0] < c.blend_time + 0.02:
-        modes.set_targets(asked, robot.KP, robot.KD)
+        modes.set_targets(asked, ALIENGO.kp, ALIENGO.kd)
         torque.append((modes.kp * (modes.target - q))[0, 0])
         modes.advance(q)
-    assert torque[-1] == pytest.approx(robot.KP * 0.3)
-    step = c.stand_kp * abs(robot.NOMINAL_Q[0]) + robot.KP * 0.3
+    assert torque[-1] == pytest.approx(ALIENGO.kp * 0.3)
+    step = c.stand_kp * abs(ALIENGO.nominal_q[0]) + ALIENGO.kp * 0.3
     assert np.abs(np.diff(torque)).max() == pytest.approx(step * TICK_S / c.blend_time, rel=0.01)
 
 
 def test_robots_that_lie_stand_up(monkeypatch, actor):
     only(monkeypatch, Mode.DAMPING)
     monkeypatch.setattr(walks, "MAX_MODE_S", walks.MIN_MODE_S)  # stance after 0.2 + 0.8 + 1.2 s
-    env = VelocityEnv(EnvConfig(n=3, threads=1, seed=1, randomisation=Randomisation.none(), commands=STILL))
+    env = VelocityEnv(
+        EnvConfig(robot=ALIENGO, n=3, threads=1, seed=1, randomisation=Randomisation.none(), commands=STILL)
+    )
     walking = Walks(env, actor)
-    assert env.height.max() < robot.LIE_HEIGHT + 0.1
+    assert env.height.max() < ALIENGO.lie_height + 0.1
     assert (walking.previous_action == 0.0).all()
     for _ in range(round(2.5 / TICK_S)):
         walking.advance(walking.sense(), walking.truth)
     assert not walking.over.any()
-    assert env.height == pytest.approx(robot.NOMINAL_HEIGHT, abs=0.03)  # the gains give way
+    assert env.height == pytest.approx(ALIENGO.nominal_height, abs=0.03)  # the gains give way
     assert np.abs(env.velocity).max() < 0.05
 
 
 def test_readings_are_the_truth_but_for_noise_and_bias(monkeypatch, actor):
     only(monkeypatch, Mode.STANCE)
-    env = VelocityEnv(EnvConfig(n=400, seed=1, randomisation=Randomisation.none(), commands=STILL))
+    env = VelocityEnv(
+        EnvConfig(robot=ALIENGO, n=400, seed=1, randomisation=Randomisation.none(), commands=STILL)
+    )
     walking = Walks(env, actor)
     sensed = walking.sense()
     scale = np.sqrt(
@@ -138,7 +141,7 @@ def moving(**changes) -> RobotState:
     still = RobotState(
         time=0.0,
         tick=0,
-        q=robot.NOMINAL_Q,
+        q=ALIENGO.nominal_q,
         dq=np.linspace(-4.0, 3.0, 12),
         tau=np.zeros(12),
         quaternion=np.array([1.0, 0.0, 0.0, 0.0]),

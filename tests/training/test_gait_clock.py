@@ -13,6 +13,7 @@ from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E
 from quadvel_training.gait_clock import START_PHASE, GaitClock, duty_factor, step_frequency  # noqa: E402
 from quadvel_training.privileged import ACTION_SCALE, Past, total_action  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 PERIOD = 0.02  # s
 WALK, STAND = np.array([[1.0, 0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]])
@@ -59,7 +60,9 @@ def test_a_mirrored_robot_sees_its_clock_with_the_other_sign():
 
 
 def test_the_scripted_trot_alone_keeps_a_nominal_robot_on_its_feet():
-    config = EnvConfig(n=1, threads=1, period=PERIOD, timestep=0.004, randomisation=Randomisation.none())
+    config = EnvConfig(
+        robot=ALIENGO, n=1, threads=1, period=PERIOD, timestep=0.004, randomisation=Randomisation.none()
+    )
     commands = CommandRange(vx=(0.5, 0.5), vy=0.0, wz=0.0, ellipsoid=False, stance=0.0)
     env = VelocityEnv(attrs.evolve(config, commands=commands, ramped=0.0))
     past, contact = Past(env), []

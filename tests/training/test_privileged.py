@@ -8,7 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
-from quadvel_description import robot, symmetry  # noqa: E402
+from quadvel_description import symmetry  # noqa: E402
 from quadvel_sim.terrain import Terrain  # noqa: E402
 from quadvel_training import loop, privileged, process_group  # noqa: E402
 from quadvel_training.command_grid import CELL_WIDTH, INITIAL_REACH, CommandGrid, GridConfig  # noqa: E402
@@ -29,9 +29,12 @@ from quadvel_training.walking_rewards import (  # noqa: E402
     WalkingWeights,
     hip_deviation,
 )
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 SMALL = PrivilegedConfig(n=6, threads=1, length=4)
-CALM = EnvConfig(n=4, threads=1, period=0.02, timestep=0.004, randomisation=Randomisation.none())
+CALM = EnvConfig(
+    robot=ALIENGO, n=4, threads=1, period=0.02, timestep=0.004, randomisation=Randomisation.none()
+)
 
 
 @pytest.fixture
@@ -117,7 +120,7 @@ def test_the_mirrored_robot_observes_the_mirror_image():
     for ids, mirror in ((0, lambda x: x), (1, symmetry.JOINTS)):
         env._qpos[ids, 3:7] = [1.0, 0.0, 0.0, 0.0]
         env._qpos[ids, 2] = 0.4
-        env._qpos[ids, 7:] = mirror(joints) + privileged.robot.NOMINAL_Q
+        env._qpos[ids, 7:] = mirror(joints) + privileged.ALIENGO.nominal_q
         env._qvel[ids, 6:] = mirror(3 * joints)
         env._qvel[ids, :6] = [0.5, (0.1, -0.1)[ids], 0.0, (0.2, -0.2)[ids], 0.3, (0.4, -0.4)[ids]]
     env._update_state()
@@ -308,8 +311,8 @@ def test_numbered_checkpoints_are_kept(tmp_path):
 
 
 def test_hips_away_from_straight_down_cost_and_less_so_sideways():
-    env = VelocityEnv(EnvConfig(n=2, threads=1, randomisation=Randomisation.none()))
-    env.q = np.tile(robot.NOMINAL_Q, (2, 1))
+    env = VelocityEnv(EnvConfig(robot=ALIENGO, n=2, threads=1, randomisation=Randomisation.none()))
+    env.q = np.tile(ALIENGO.nominal_q, (2, 1))
     env.q[:, ::3] = [0.1, -0.2, 0.0, 0.3]
     assert hip_deviation(env, np.array([[1.0, 0.0, 0.5, 0.0], [0.0, -0.5, 0.0, 0.0]])) == pytest.approx(
         [0.6, 0.3]

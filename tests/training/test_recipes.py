@@ -9,7 +9,6 @@ import pytest
 pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
 from quadvel_actuator import ActuatorModel
-from quadvel_description.robot import ALIENGO
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_training import loop, recipe, stages
@@ -19,6 +18,7 @@ from quadvel_training.estimator import EstimatorConfig
 from quadvel_training.loop import Budget
 from quadvel_training.privileged import PrivilegedConfig
 from quadvel_training.randomisation import load_actuator, sample_actuators
+from tests.helpers.robots import ALIENGO
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_the_stages_share_robots_and_commands(name, kind):
 
 def test_plain_pd_joints_have_gains_and_delays_of_their_own(ablation):
     config, ids = ablation["rl_pd"], np.arange(400)
-    joints = ActuatorModel(load_actuator(config.actuator), (400, 12))
+    joints = ActuatorModel(load_actuator(ALIENGO, config.actuator), (400, 12))
     for _ in range(2):  # drawing again starts from the nominal joints, not from those drawn before
         sample_actuators(joints, ids, config.randomisation, np.random.default_rng(0))
     for drawn, (low, high) in (

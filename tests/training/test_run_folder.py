@@ -11,12 +11,12 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_actuator import ActuatorParameters, Effect  # noqa: E402
 from quadvel_description.quadruped import JOINT_NAMES  # noqa: E402
-from quadvel_description.robot import ALIENGO  # noqa: E402
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import loop, run_folder, stages  # noqa: E402
 from quadvel_training.constrained import ConstrainedConfig  # noqa: E402
 from quadvel_training.loop import Budget  # noqa: E402
 from quadvel_training.networks import Recurrent  # noqa: E402
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def drives(tmp_path):
     """An actuator file with an effect that is known within an interval."""
     effect = Effect("coulomb_friction", JOINT_NAMES, {"c": 0.5, "v_0": 0.05}, {}, {"c": [0.3, 0.7]})
     path = tmp_path / "actuator.yaml"
-    attrs.evolve(ActuatorParameters.default(), effects=(effect,)).save(path)
+    attrs.evolve(ActuatorParameters.of(ALIENGO), effects=(effect,)).save(path)
     return path
 
 

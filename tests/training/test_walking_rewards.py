@@ -8,10 +8,9 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
-from quadvel_description import robot  # noqa: E402
 from quadvel_description.quadruped import joint_index  # noqa: E402
 from quadvel_eval.gait_kind import GaitKind  # noqa: E402
-from quadvel_training import gait_log, privileged  # noqa: E402
+from quadvel_training import gait_log  # noqa: E402
 from quadvel_training.command_grid import CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.gait_clock import duty_factor  # noqa: E402
@@ -23,9 +22,12 @@ from quadvel_training.walking_rewards import (  # noqa: E402
     WalkingRewards,
     WalkingWeights,
 )
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 N = 3
-CALM = EnvConfig(n=N, threads=1, period=0.02, timestep=0.004, randomisation=Randomisation.none())
+CALM = EnvConfig(
+    robot=ALIENGO, n=N, threads=1, period=0.02, timestep=0.004, randomisation=Randomisation.none()
+)
 
 
 @pytest.fixture
@@ -68,11 +70,11 @@ def test_stance_is_fined_at_lift_off_by_how_far_its_middle_is_from_the_hip(env, 
     env.contact[:] = True
     env.contact[:, 0] = False
     past.advance(np.zeros((N, 4)))
-    env.foot_position[..., 0] = privileged.HIPS_AHEAD + ahead
+    env.foot_position[..., 0] = ALIENGO.legs.hips[:, 0] + ahead
     env.contact[:, 0] = True
     past.advance(np.zeros((N, 4)))
     assert not past.off_hip.any()
-    env.foot_position[:, 0, 0] = privileged.HIPS_AHEAD[0] + left
+    env.foot_position[:, 0, 0] = ALIENGO.legs.hips[:, 0][0] + left
     past.advance(np.zeros((N, 4)))
     env.foot_position[:, 0, 0] = 9.9  # in the air it counts no more
     env.contact[:, 0] = False
@@ -95,7 +97,7 @@ def test_sway_is_the_sideways_velocity_off_its_mean_over_a_stride(env, past):
 def test_roll_rate_and_joints_beyond_eight_tenths_of_their_drives_speed_are_fined(env, past):
     env.angular_velocity[:, 0] = [0.0, 2.0, 100.0]
     env.fastest[:] = 0.0
-    env.fastest[1] = OVERSPEED_SHARE * robot.VELOCITY_LIMIT
+    env.fastest[1] = OVERSPEED_SHARE * ALIENGO.velocity_limit
     env.fastest[1, 2] += 1.5
     env.fastest[2, 0] = 1e3
     w = WalkingWeights()
@@ -140,8 +142,8 @@ def test_a_rated_drive_gives_full_torque_at_rest_and_none_at_its_top_speed():
     names = [joint for effect in rated_drives().effects for joint in effect.joints]
     order = joint_index(names)
     assert sorted(order) == list(range(12))
-    assert stall == pytest.approx(np.outer(robot.TORQUE_LIMIT[order], RATED_STALL))
-    assert no_load == pytest.approx(np.outer(robot.VELOCITY_LIMIT[order], RATED_SPEED))
+    assert stall == pytest.approx(np.outer(ALIENGO.torque_limit[order], RATED_STALL))
+    assert no_load == pytest.approx(np.outer(ALIENGO.velocity_limit[order], RATED_SPEED))
 
 
 def test_the_kind_of_gait_is_logged_at_each_speed_with_each_numbered_checkpoint(tmp_path, capsys):

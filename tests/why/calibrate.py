@@ -12,12 +12,12 @@ from typing import Annotated
 
 import typer
 
-from quadvel_description.robot import ALIENGO
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import LIMITS_FILE
 from quadvel_why.links import CAUSES
 from quadvel_why.reading import read_run
 from quadvel_why.signals import Signals
+from tests.helpers.robots import ALIENGO
 from tests.why.walks import Defect, RecordedWalk, make_script
 
 FIRST_SEED = 900

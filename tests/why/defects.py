@@ -22,6 +22,7 @@ from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy.modes import Policy
 from quadvel_sim.simulator import Simulator
 from quadvel_sim.terrain import Terrain
+from tests.helpers.robots import ALIENGO
 
 from .walks import TICK_MS, Defect, Velocity
 
@@ -351,7 +352,7 @@ def _place(joints: Sequence[int], value: float, base: float = 0.0) -> Array:
 
 
 def _actuator(**fields: Any) -> dict[str, Any]:
-    return {"actuator": attrs.evolve(ActuatorParameters.default(), **fields)}
+    return {"actuator": attrs.evolve(ActuatorParameters.of(ALIENGO), **fields)}
 
 
 def _speed_limit(stall: float, no_load: float) -> dict[str, Any]:

@@ -18,11 +18,11 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from quadvel_description.robot import ALIENGO
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import diagnose
 from quadvel_why.reading import read_run
 from quadvel_why.signals import Signals
+from tests.helpers.robots import ALIENGO
 from tests.why.cases import STRENGTHS, Case, all_cases, record
 from tests.why.defects import ALSO_RIGHT
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from quadvel_bringup.recording_file import RawMessage, RecordingFile
 from quadvel_description.arrays import Array
-from quadvel_description.robot import ALIENGO
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.learned import LearnedEstimator
@@ -27,6 +26,7 @@ from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import MotorStatus, TickInput
 from quadvel_recordings.definitions import STORE
 from quadvel_sim.simulator import Simulator, SimulatorConfig
+from tests.helpers.robots import ALIENGO
 
 TICK_MS = 5
 MUX_MS = 20
@@ -141,7 +141,9 @@ class RecordedWalk:
         prepare: Callable[[Simulator], None] | None = None,
     ) -> None:
         self.defect, self.messages = defect, Messages()
-        self.simulator = Simulator(SimulatorConfig(**{"seed": seed, **(plant or {}), **defect.plant}))
+        self.simulator = Simulator(
+            SimulatorConfig(robot=ALIENGO, **{"seed": seed, **(plant or {}), **defect.plant})
+        )
         self.simulator.reset("stand")
         if prepare is not None:
             prepare(self.simulator)

@@ -15,6 +15,8 @@ import torch
 from mujoco.batch import Batch
 
 from quadvel_description.arrays import Array
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_eval.bench import Benchmark
 from quadvel_policy.observation import OBSERVATION_SIZE
 
@@ -57,7 +59,9 @@ def _bare_tick(env: VelocityEnv) -> Callable[[], None]:
     It uses the same states because robots on their feet are faster to simulate than robots that
     stumble.
     """
-    batch = Batch(training_model(env.config.timestep, env.config.terrain), env.config.n, env.config.threads)
+    batch = Batch(
+        training_model(env.robot, env.config.timestep, env.config.terrain), env.config.n, env.config.threads
+    )
     rows = [(batch.bind(name), env.batch.bind(name)) for name in ("qpos", "qvel", "ctrl")]
 
     def tick() -> None:
@@ -80,7 +84,7 @@ def environment(n: int = 512, threads: int = 2, timestep: float = 0.001) -> dict
     Returns:
         Steps per second of both, and their ratio.
     """
-    config = EnvConfig(n=n, threads=threads, timestep=timestep)
+    config = EnvConfig(robot=load_robot(DEFAULT_ROBOT), n=n, threads=threads, timestep=timestep)
     env = VelocityEnv(config)
     rewards = Table2(env, RewardWeights())
     action = np.zeros((n, 12), np.float32)

@@ -18,6 +18,8 @@ import numpy as np
 import torch
 
 from quadvel_description import symmetry
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_policy.observation import OBSERVATION_SIZE
 from quadvel_sim.terrain import Terrain
 
@@ -43,6 +45,7 @@ class ConstrainedConfig:
     """Configuration of one run; a recipe file sets these fields.
 
     Attributes:
+        robot: name of a shipped robot, or path of a robot.yaml.
         budget: when the run ends.
         n: number of robots, of all processes together.
         threads: threads of the physics.
@@ -74,6 +77,7 @@ class ConstrainedConfig:
         ppo: hyperparameters of the learner.
     """
 
+    robot: str = DEFAULT_ROBOT
     budget: Budget = Budget(samples=1e8, minutes=6e3)
     n: int = 512
     threads: int = attrs.field(factory=available_cores)
@@ -127,12 +131,14 @@ class ConstrainedRun:
         self.grid = CommandGrid(c.grid)
         if "grid" in known:
             self.grid.restore(known["grid"])
+        robot = load_robot(c.robot)
         env_config = EnvConfig(
+            robot=robot,
             n=c.n,
             threads=c.threads,
             seed=process_group.process_seed(c.seed),
             timestep=c.timestep,
-            actuator=load_actuator(c.actuator),
+            actuator=load_actuator(robot, c.actuator),
             terrain=c.terrain,
             randomisation=c.randomisation,
         )

@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from quadvel_description import robot
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_policy.observation import (
     COMMAND_AXES,
     OBSERVATION_SIZE,
@@ -54,6 +54,7 @@ class DaggerConfig:
     """Configuration of stage 2; a recipe file sets these fields.
 
     Attributes:
+        robot: name of a shipped robot, or path of a robot.yaml.
         budget: when the run ends.
         n: number of robots, of all processes together.
         threads: threads of the physics.
@@ -74,6 +75,7 @@ class DaggerConfig:
         randomisation: what varies between robots.
     """
 
+    robot: str = DEFAULT_ROBOT
     budget: Budget = Budget(samples=2e7, minutes=60.0)
     n: int = 512
     threads: int = attrs.field(factory=available_cores)
@@ -173,12 +175,14 @@ class DaggerRun:
         checkpoint = load(teacher_file)
         self.grid = CommandGrid(c.grid)
         self.grid.restore(checkpoint["grid"])
+        robot = load_robot(c.robot)
         env_config = EnvConfig(
+            robot=robot,
             n=c.n,
             threads=c.threads,
             seed=process_group.process_seed(c.seed),
             timestep=c.timestep,
-            actuator=load_actuator(c.actuator),
+            actuator=load_actuator(robot, c.actuator),
             terrain=c.terrain,
             randomisation=c.randomisation,
         )
@@ -388,7 +392,7 @@ def observe(env: VelocityEnv, previous: np.ndarray) -> np.ndarray:
         (n, 48).
     """
     return build_observation(
-        default_observation(ALIENGO), command=env.command, previous_action=previous, **env.sense()
+        default_observation(env.robot), command=env.command, previous_action=previous, **env.sense()
     )
 
 
@@ -405,14 +409,14 @@ def export_policy(
         about: how the policy was trained, for the metadata.
     """
     metadata = PolicyMetadata(
-        robot=ALIENGO.name,
+        robot=env.robot.name,
         action_offset=tuple(env.stand_q),
         action_scale=(ACTION_SCALE,) * 12,
         action_clip=(-ACTION_BOUND, ACTION_BOUND),
         kp=(env.config.kp,) * 12,
         kd=(env.config.kd,) * 12,
-        nominal_q=tuple(robot.NOMINAL_Q),
-        observation=default_observation(ALIENGO),
+        nominal_q=tuple(env.robot.nominal_q),
+        observation=default_observation(env.robot),
         command_limits=dict(zip(COMMAND_AXES, zip(limits.low, limits.high, strict=True), strict=True)),
         curve_limit=limits.curve,
         state_shape=tuple(network.initial_state(1)[0].shape),

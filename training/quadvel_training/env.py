@@ -17,11 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
-from quadvel_description import mjcf, robot
+from quadvel_description import mjcf
 from quadvel_description.command_range import split_target
 from quadvel_description.kinematics import foot_kinematics, foot_positions, roll_pitch, rotate, rotate_inverse
 from quadvel_description.quadruped import GRAVITY
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot
 from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_sim.physics import Physics
 from quadvel_sim.terrain import Terrain
@@ -35,7 +35,6 @@ RAMP_DOWN = 4.0  # factor of the slope of commands that decrease
 RAMP_AXES = np.array([1.0, 0.7, 1.25])  # factors of vx, vy and, in rad/m, wz
 EDGE_MARGIN_M = 0.6  # before the end of rough ground, where episodes time out
 MAX_PLAUSIBLE_SPEED = 150.0  # m/s or rad/s of any body or joint; beyond it the physics diverges
-STANCE_LENGTH, STANCE_WIDTH = np.ptp(foot_positions(ALIENGO, robot.NOMINAL_Q)[:, :2], axis=0)  # m
 
 
 def available_cores() -> int:
@@ -151,13 +150,14 @@ class EnvConfig:
     """Configuration of a batch of environments.
 
     Attributes:
+        robot: the robot.
         n: number of environments.
         threads: threads of the physics.
         seed: seed of all draws.
         period: s, one sample of the trainer, for which joint targets are held.
         timestep: s, of the physics.
-        kp: N m/rad, proportional gain.
-        kd: N m s/rad, derivative gain.
+        kp: N m/rad, proportional gain; the default is the robot's.
+        kd: N m s/rad, derivative gain; the default is the robot's.
         episode: s, length of an episode.
         actuator: parameters of the actuators.
         randomisation: what varies.
@@ -167,15 +167,18 @@ class EnvConfig:
         terrain: ground.
     """
 
+    robot: Robot
     n: int = 512
     threads: int = attrs.field(factory=available_cores)
     seed: int = 0
     period: float = TICK_S
     timestep: float = 0.0025
-    kp: float = robot.KP
-    kd: float = robot.KD
+    kp: float = attrs.field(default=attrs.Factory(lambda config: config.robot.kp, takes_self=True))
+    kd: float = attrs.field(default=attrs.Factory(lambda config: config.robot.kd, takes_self=True))
     episode: float = 20.0
-    actuator: ActuatorParameters = attrs.field(factory=ActuatorParameters.default)
+    actuator: ActuatorParameters = attrs.field(
+        default=attrs.Factory(lambda config: ActuatorParameters.of(config.robot), takes_self=True)
+    )
     randomisation: Randomisation = Randomisation()
     commands: CommandRange = CommandRange()
     ramped: float = 0.6
@@ -183,10 +186,13 @@ class EnvConfig:
     terrain: Terrain = Terrain()
 
 
-def training_model(timestep: float, terrain: Terrain, torsional_friction: float = 0.0) -> mujoco.MjModel:
+def training_model(
+    robot: Robot, timestep: float, terrain: Terrain, torsional_friction: float = 0.0
+) -> mujoco.MjModel:
     """Build the MuJoCo model of training: feet and trunk collide, there are no sensors.
 
     Args:
+        robot: the robot.
         timestep: s, of the physics.
         terrain: ground.
         torsional_friction: m, of the feet.
@@ -195,7 +201,7 @@ def training_model(timestep: float, terrain: Terrain, torsional_friction: float 
         The compiled model.
     """
     plant = mjcf.Plant(timestep=timestep, plane=False, only_feet_and_trunk=True, sensors=False)
-    spec = mjcf.build_spec(plant)
+    spec = mjcf.build_spec(robot, plant)
     terrain.add_to(spec)
     model = spec.compile()
     Physics(torsional_friction=torsional_friction).apply(model)
@@ -210,6 +216,7 @@ class VelocityEnv:
 
     Attributes:
         config: configuration.
+        robot: the robot.
         commands: source of commands.
         command: (n, 4), command in force; it may still ramp to the one that was drawn.
         q: (n, 12), rad.
@@ -242,8 +249,9 @@ class VelocityEnv:
             commands: source of commands in place of the configuration's range.
         """
         self.config = c = config
+        self.robot = robot = c.robot
         self.commands: Commands = commands or c.commands
-        self.model = training_model(c.timestep, c.terrain, c.randomisation.torsional_friction[1])
+        self.model = training_model(c.robot, c.timestep, c.terrain, c.randomisation.torsional_friction[1])
         self.substeps = round(c.period / c.timestep)
         self._resend = max(1, int(TICK_S / c.timestep))  # steps between command packets
         self.rng = np.random.default_rng(c.seed)
@@ -253,7 +261,8 @@ class VelocityEnv:
         self._qpos, self._qvel, self._ctrl, self._clock = (
             self.batch.bind(name) for name in ("qpos", "qvel", "ctrl", "time")
         )
-        self.stand_q = robot.NOMINAL_Q + mjcf.gravity_torque(self.model) / c.kp
+        self._stance = np.ptp(foot_positions(robot, robot.nominal_q)[:, :2], axis=0)  # length, width, m
+        self.stand_q = robot.nominal_q + mjcf.gravity_torque(self.model) / c.kp
 
         n = c.n
         self.command = np.zeros((n, 4))
@@ -272,12 +281,12 @@ class VelocityEnv:
         self._edge = 0.5 * c.terrain.size - EDGE_MARGIN_M if rough else np.inf  # m
         self.reset(np.arange(n))
 
-    def reset(self, ids: np.ndarray, posture: np.ndarray = robot.NOMINAL_Q) -> None:
+    def reset(self, ids: np.ndarray, posture: np.ndarray | None = None) -> None:
         """Start robots over: new plant, new actuators, a new command.
 
         Args:
             ids: their indices.
-            posture: rad, (12,) or (n, 12), joint positions up to some noise.
+            posture: rad, (12,) or (n, 12), joint positions up to some noise; None: the stance.
         """
         if not len(ids):
             return
@@ -289,9 +298,9 @@ class VelocityEnv:
         heading = rng.uniform(-np.pi, np.pi, n)
         qpos[:, :2] = rng.uniform(-1, 1, (n, 2)) * self._spawn_radius
         qpos[:, 3:7] = self._ground_attitudes(qpos[:, :2], heading)
-        qpos[:, 7:] = posture + rng.normal(0, 0.08, (n, 12))
-        feet = rotate(qpos[:, None, 3:7], foot_positions(ALIENGO, qpos[:, 7:])) + qpos[:, None, :3]
-        qpos[:, 2] = np.max(self._ground(feet) - feet[..., 2], axis=1) + robot.FOOT_RADIUS + 0.002
+        qpos[:, 7:] = (self.robot.nominal_q if posture is None else posture) + rng.normal(0, 0.08, (n, 12))
+        feet = rotate(qpos[:, None, 3:7], foot_positions(self.robot, qpos[:, 7:])) + qpos[:, None, :3]
+        qpos[:, 2] = np.max(self._ground(feet) - feet[..., 2], axis=1) + self.robot.foot_radius + 0.002
         self._qpos[ids], self._qvel[ids] = qpos, qvel
         self._clock[ids] = self.config.period  # above 0, so that MuJoCo's own resets are seen
         self.time[ids] = rng.uniform(0, 0.2, n) * self.config.episode
@@ -313,19 +322,18 @@ class VelocityEnv:
             Quaternions (n, 4), w first, body to world.
         """
         level = Rotation.from_euler("Z", heading[:, None])
-        corners = foot_positions(ALIENGO, robot.NOMINAL_Q)
+        corners = foot_positions(self.robot, self.robot.nominal_q)
         feet = np.stack([level.apply(corner) for corner in corners], axis=1)
         forward, left = self._ground_drop(self._ground(feet[..., :2] + place[:, None]))
         pitch = np.arctan(forward)
         leaning = Rotation.from_euler("YX", np.stack([pitch, -np.arctan(left * np.cos(pitch))], axis=1))
         return np.roll((level * leaning).as_quat(), 1, axis=1)
 
-    @staticmethod
-    def _ground_drop(ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _ground_drop(self, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Drop of the ground per metre forward and left, from its height (n, 4) at the feet."""
         forward = ground[:, 2:].mean(axis=1) - ground[:, :2].mean(axis=1)
         left = ground[:, ::2].mean(axis=1) - ground[:, 1::2].mean(axis=1)
-        return forward / STANCE_LENGTH, left / STANCE_WIDTH
+        return forward / self._stance[0], left / self._stance[1]
 
     def _new_commands(self, ids: np.ndarray) -> None:
         """Draw new commands, some of them reversals of the one before, and their ramps."""
@@ -378,10 +386,10 @@ class VelocityEnv:
         self.power[:], self.fastest[:] = 0.0, 0.0
         self._push()
         end = self._clock.ravel() + self.config.period
-        q, dq = self._qpos[:, 7:], self._qvel[:, 6:]
+        robot, q, dq = self.robot, self._qpos[:, 7:], self._qvel[:, 6:]
         for step in range(self.substeps):
             if step % self._resend == 0:
-                sent, push = split_target(target, gains[0], q)
+                sent, push = split_target(robot, target, gains[0], q)
             if step == self.substeps - 1:
                 before = self._qvel[:, :3].copy()
             self.torque = self.actuators.step(q, dq, sent, *gains, target_speed, push)
@@ -418,7 +426,7 @@ class VelocityEnv:
         ids = np.flatnonzero(self.broken)
         if len(ids):
             self._qpos[ids, :3], self._qpos[ids, 3:7] = 0.0, [0.0, 1.0, 0.0, 0.0]
-            self._qpos[ids, 7:], self._qvel[ids] = robot.NOMINAL_Q, 0.0
+            self._qpos[ids, 7:], self._qvel[ids] = self.robot.nominal_q, 0.0
             self.torque[ids], self.power[ids], self.fastest[ids], before[ids] = 0.0, 0.0, 0.0, 0.0
             self.actuators.reset(ids)
 
@@ -447,14 +455,14 @@ class VelocityEnv:
         self.velocity = rotate_inverse(self.quaternion, qvel[:, :3])
         self.roll_pitch = roll_pitch(self.quaternion)
         quaternion = self.quaternion[:, None]
-        local, jacobians = foot_kinematics(ALIENGO, self.q)
+        local, jacobians = foot_kinematics(self.robot, self.q)
         self.foot_position = local
         self.feet = rotate(quaternion, local) + qpos[:, None, :3]
         # v_foot = R (J dq + w x r) + v_trunk
         joints = self.dq.reshape(-1, 4, 3, 1)
         swing = (jacobians @ joints)[..., 0] + np.cross(self.angular_velocity[:, None], local)
         self.foot_velocity = rotate(quaternion, swing) + qvel[:, None, :3]
-        self.clearance = self.feet[..., 2] - self._ground(self.feet) - robot.FOOT_RADIUS
+        self.clearance = self.feet[..., 2] - self._ground(self.feet) - self.robot.foot_radius
         self.contact = self.clearance < 0.001
         self.height = qpos[:, 2] - self._ground(qpos)
         self.fallen = (self.height < 0.18) | (np.abs(self.roll_pitch).max(axis=1) > 0.9)

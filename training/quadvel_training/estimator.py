@@ -18,7 +18,8 @@ import numpy as np
 import torch
 
 from quadvel_description.quadruped import GRAVITY
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import ALIENGO, load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_estimator import features
 from quadvel_sim.terrain import Terrain
 
@@ -192,6 +193,7 @@ class EstimatorConfig:
     """Configuration of the estimator; half of the robots walk on flat ground, half on rough.
 
     Attributes:
+        robot: name of a shipped robot, or path of a robot.yaml.
         budget: when the run ends.
         n: number of robots, of all processes together.
         length: ticks per sequence.
@@ -207,6 +209,7 @@ class EstimatorConfig:
         rough: the rough ground.
     """
 
+    robot: str = DEFAULT_ROBOT
     budget: Budget = Budget(samples=8e6, minutes=15.0)
     n: int = 512
     length: int = 48
@@ -265,6 +268,7 @@ class EstimatorRun:
         self.walks = [
             EstimatedWalks(walks, self.network)
             for walks in walks_on_both_grounds(
+                load_robot(config.robot),
                 config.n,
                 process_group.process_seed(config.seed),
                 config.commands,

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from quadvel_description.robot import load_robot
 from quadvel_eval.gait_kind import GaitKind
 
 from .env import EnvConfig, VelocityEnv
@@ -64,12 +65,14 @@ def measure_gaits(run: PrivilegedRun) -> dict[float, GaitKind | None]:
         Kind of gait by speed, m/s; None if the robot fell.
     """
     c = run.config
+    robot = load_robot(c.robot)
     config = EnvConfig(
+        robot=robot,
         n=len(SPEEDS),
         threads=1,
         period=SAMPLE_S,
         timestep=c.timestep,
-        actuator=load_actuator(c.actuator),
+        actuator=load_actuator(robot, c.actuator),
         randomisation=Randomisation.none(),
         ramped=0.0,
         episode=2 * WALK_S,

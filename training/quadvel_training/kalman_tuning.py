@@ -8,7 +8,8 @@ import attrs
 import numpy as np
 from scipy.optimize import minimize
 
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import ALIENGO, load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.state import RobotState
 from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator
 from quadvel_sim.terrain import Terrain
@@ -27,6 +28,7 @@ class TuningConfig:
     """Configuration of the tuning; half of the robots walk on flat ground, half on rough.
 
     Attributes:
+        robot: name of a shipped robot, or path of a robot.yaml.
         n: number of robots.
         window: s, length of a window; each one is filtered separately.
         windows: number of windows per robot.
@@ -37,6 +39,7 @@ class TuningConfig:
         rough: the rough ground.
     """
 
+    robot: str = DEFAULT_ROBOT
     n: int = 64
     window: float = 2.0
     windows: int = 8
@@ -76,7 +79,13 @@ def record(config: TuningConfig, actor: Recurrent) -> WalkRecording:
     grounds = [
         [_window(walks, ticks) for _ in range(config.windows)]
         for walks in walks_on_both_grounds(
-            config.n, config.seed, config.commands, config.randomisation, config.rough, actor
+            load_robot(config.robot),
+            config.n,
+            config.seed,
+            config.commands,
+            config.randomisation,
+            config.rough,
+            actor,
         )
     ]
     parts = [window for ground in grounds for window in ground]

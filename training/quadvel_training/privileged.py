@@ -17,7 +17,9 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from quadvel_description import robot, symmetry
+from quadvel_description import symmetry
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.symmetry import Mirror
 from quadvel_sim.terrain import Terrain
 
@@ -42,7 +44,6 @@ ACTION_BOUND = 4.0  # in the network's unit
 STRIDE_S = 0.35  # time constant of stride errors: about a stride
 LASTING_S = 1.5  # time constant of lasting errors
 TRANSIENT_S = 1.0  # after a new command, not part of lasting errors and scores
-HIPS_AHEAD = robot.ALIENGO.legs.hips[:, 0]  # m, body frame
 STANDING_S = 0.2  # on four feet; after that, setting off means choosing a side
 WALKING_HEIGHT_M = 0.38  # typical height of the trunk
 
@@ -96,7 +97,7 @@ class Past:
             env: environments.
         """
         n = env.config.n
-        self.env = env
+        self.env, self._hips_ahead = env, env.robot.legs.hips[:, 0]  # m, body frame
         self.stride, self.lasting = np.zeros((n, 3)), np.zeros((n, 3))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
         self.off_hip, self.clock = np.zeros((n, 4)), GaitClock(n)
@@ -134,7 +135,7 @@ class Past:
 
     def _advance_stances(self) -> None:
         """Record where feet touch down and lift off; `down` is still that of the sample before."""
-        contact, ahead = self.env.contact, self.env.foot_position[..., 0] - HIPS_AHEAD
+        contact, ahead = self.env.contact, self.env.foot_position[..., 0] - self._hips_ahead
         was_down = self.down > 0.0
         self._landed = np.where(contact & ~was_down, ahead, self._landed)
         self.off_hip = np.where(was_down & ~contact, 0.5 * (self._landed + self._last), 0.0)
@@ -177,7 +178,7 @@ def observe_state(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndar
         [
             env.command,
             2 * env.roll_pitch,
-            2 * (env.q - robot.NOMINAL_Q),
+            2 * (env.q - env.robot.nominal_q),
             0.1 * env.dq,
             env.velocity,
             0.5 * env.angular_velocity,
@@ -245,6 +246,7 @@ class PrivilegedConfig:
     """Configuration of stage 1; a recipe file sets these fields.
 
     Attributes:
+        robot: name of a shipped robot, or path of a robot.yaml.
         budget: when the run ends.
         n: number of robots, of all processes together.
         threads: threads of the physics.
@@ -266,6 +268,7 @@ class PrivilegedConfig:
         ppo: hyperparameters of the learner.
     """
 
+    robot: str = DEFAULT_ROBOT
     budget: Budget = Budget(samples=2e8, minutes=6e3)
     n: int = 512
     threads: int = attrs.field(factory=available_cores)
@@ -364,13 +367,15 @@ class PrivilegedRun:
         self.config = c = attrs.evolve(config, n=process_group.local_share(config.n))
         torch.manual_seed(c.seed)
         self.grid = CommandGrid(c.grid)
+        robot = load_robot(c.robot)
         env_config = EnvConfig(
+            robot=robot,
             n=c.n,
             threads=c.threads,
             seed=process_group.process_seed(c.seed),
             period=SAMPLE_S,
             timestep=c.timestep,
-            actuator=load_actuator(c.actuator),
+            actuator=load_actuator(robot, c.actuator),
             terrain=c.terrain,
             randomisation=c.randomisation,
             ramped=c.ramped,

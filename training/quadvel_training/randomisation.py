@@ -10,7 +10,7 @@ from mujoco.batch import Batch
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters, Effect
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
+from quadvel_description.robot import Robot
 
 STALL_RANGE_NM, NO_LOAD_RANGE_RAD_S = (24.0, 60.0), (12.0, 30.0)  # of `limited`, drawn per robot
 RATED_STALL, RATED_SPEED = (
@@ -19,43 +19,51 @@ RATED_STALL, RATED_SPEED = (
 )  # of `rated`: shares of the torque and speed limits
 
 
-def limited_drives() -> ActuatorParameters:
+def limited_drives(robot: Robot) -> ActuatorParameters:
     """Actuators with torque limits that fall with speed, from weak to strong drives.
 
+    Args:
+        robot: The robot.
+
     Returns:
-        The shipped actuator model with a speed-torque curve drawn for each robot.
+        The robot's actuator model with a speed-torque curve drawn for each robot.
     """
     middle = {"stall": float(np.mean(STALL_RANGE_NM)), "no_load": float(np.mean(NO_LOAD_RANGE_RAD_S))}
     ranges = {"stall": STALL_RANGE_NM, "no_load": NO_LOAD_RANGE_RAD_S}
     effect = Effect("torque_speed_limit", JOINT_NAMES, middle, intervals=ranges)
-    return attrs.evolve(ActuatorParameters.default(), name="aliengo, limited", effects=(effect,))
+    return attrs.evolve(ActuatorParameters.of(robot), name=f"{robot.name}, limited", effects=(effect,))
 
 
-def rated_drives() -> ActuatorParameters:
-    """Actuators with the AlienGo's speed-torque curve.
+def rated_drives(robot: Robot) -> ActuatorParameters:
+    """Actuators with the rated speed-torque curve of the robot.
 
     The full torque is available up to about half the top speed, none at it. For each robot the
     stall torque is `RATED_STALL` times the torque limit, which clips it, and the no-load speed is
     `RATED_SPEED` times the speed limit.
 
+    Args:
+        robot: The robot.
+
     Returns:
-        The shipped actuator model with these curves.
+        The robot's actuator model with these curves.
     """
     kinds = {kind: tuple(name for name in JOINT_NAMES if kind in name) for kind in ("hip", "thigh", "calf")}
     effects = []
     for k, joints in enumerate(kinds.values()):
         stall, no_load = (
             tuple(float(share * limit[k]) for share in shares)
-            for shares, limit in ((RATED_STALL, TORQUE_LIMIT), (RATED_SPEED, VELOCITY_LIMIT))
+            for shares, limit in ((RATED_STALL, robot.torque_limit), (RATED_SPEED, robot.velocity_limit))
         )
         middle = {"stall": float(np.mean(stall)), "no_load": float(np.mean(no_load))}
         ranges = {"stall": stall, "no_load": no_load}
         effects.append(Effect("torque_speed_limit", joints, middle, intervals=ranges))
-    return attrs.evolve(ActuatorParameters.default(), name="aliengo, rated drives", effects=tuple(effects))
+    return attrs.evolve(
+        ActuatorParameters.of(robot), name=f"{robot.name}, rated drives", effects=tuple(effects)
+    )
 
 
 ACTUATORS = {
-    "eam": ActuatorParameters.default,
+    "eam": ActuatorParameters.of,
     "limited": limited_drives,
     "rated": rated_drives,
     "ideal": ActuatorParameters.ideal,
@@ -240,17 +248,18 @@ class PlantSampler:
         self.drawn[ids] = np.concatenate([friction, payload[:, None], shift / max(r.com_shift, 1e-3)], axis=1)
 
 
-def load_actuator(name: str) -> ActuatorParameters:
+def load_actuator(robot: Robot, name: str) -> ActuatorParameters:
     """Return the actuators that a recipe names.
 
     Args:
-        name: `eam` (Table 4), `limited` or `rated` (with speed-torque curves), `ideal` (PD law), or
-            an actuator file.
+        robot: The robot.
+        name: `eam` (the robot's file), `limited` or `rated` (with speed-torque curves), `ideal` (PD law),
+            or an actuator file.
 
     Returns:
         Their parameters.
     """
-    return ACTUATORS[name]() if name in ACTUATORS else ActuatorParameters.load(name)
+    return ACTUATORS[name](robot) if name in ACTUATORS else ActuatorParameters.load(name)
 
 
 def sample_actuators(

@@ -8,8 +8,6 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from quadvel_description import robot
-
 from .env import HEAT_LOSS_W_PER_N2M2, TICK_S, VelocityEnv
 from .walking_rewards import hip_deviation
 
@@ -129,10 +127,10 @@ class Table2:
             "foot_clearance": clearance.sum(axis=1) * decay,
             "action_smoothness": -np.abs(bend).sum(axis=1),
             "hips": -hip_deviation(env, c),
-            "overspeed": -np.maximum(np.abs(env.dq) - OVERSPEED_SHARE * robot.VELOCITY_LIMIT, 0.0).sum(
+            "overspeed": -np.maximum(np.abs(env.dq) - OVERSPEED_SHARE * env.robot.velocity_limit, 0.0).sum(
                 axis=1
             ),
-            "posture": -np.abs(env.q - robot.NOMINAL_Q).sum(axis=1) * ~walking,
+            "posture": -np.abs(env.q - env.robot.nominal_q).sum(axis=1) * ~walking,
             "stillness": -(np.hypot(v[:, 0], v[:, 1]) + 0.05 * np.abs(env.dq).sum(axis=1)) * ~walking,
         }
         self._air_time = np.where(env.contact, 0.0, self._air_time + TICK_S)

@@ -12,6 +12,7 @@ from typing import Any
 import cattrs
 from typing_extensions import override
 
+from quadvel_description.robot import load_robot
 from quadvel_eval.grid import grid_cells, run_cell, run_stance, summarise
 from quadvel_eval.pool import Call, run_in_parallel
 from quadvel_eval.report import write_json
@@ -93,7 +94,7 @@ class EvaluatedPolicies(loop.Keeper):
         policy = kept.with_suffix(".onnx")
         run.write_policy(policy, {"samples": run.samples})
         name = run.config.actuator
-        plant = {} if name in ACTUATORS else {"actuator": load_actuator(name)}
+        plant = {} if name in ACTUATORS else {"actuator": load_actuator(load_robot(run.config.robot), name)}
         found = _evaluate(Setup(policy=policy, plant=plant))
         write_json(kept.with_suffix(".json"), found)
         figures = ("falls", "mean_error_xy", "max_error_xy")

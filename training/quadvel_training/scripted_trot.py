@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from quadvel_description import robot
 from quadvel_description.kinematics import foot_positions, inverse_kinematics
-from quadvel_description.robot import ALIENGO
 
 from .env import VelocityEnv
 from .gait_clock import GaitClock, duty_factor, step_frequency
 
 CROUCH_M = 0.03  # by which the trunk is lower than in the nominal posture: longer steps are in reach
-FEET = foot_positions(ALIENGO, robot.NOMINAL_Q) + np.array([0.0, 0.0, CROUCH_M])  # (4, 3), m, trunk frame
 LIFT_M = 0.08  # height of a swing
 LONGEST_STEP_M = 0.36  # way of a foot under the trunk in one stance
 LEAD_S = 0.05  # joints follow their targets so late
@@ -36,7 +33,8 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
     Returns:
         (n, 12), rad; 0 while standing.
     """
-    command = env.command
+    robot, command = env.robot, env.command
+    below = foot_positions(robot, robot.nominal_q) + np.array([0.0, 0.0, CROUCH_M])  # (4, 3), m, trunk frame
     vx, vy, wz, standing = command.T
     duty, frequency = duty_factor(command), step_frequency(command)
     ahead = LEAD_S * frequency
@@ -44,7 +42,7 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
     swing, down = np.maximum(share, 0.0), share < 0.0  # s: share of the planned swing that is over
     # velocity of the ground under a foot at (x, y): -(vx - wz y, vy + wz x); a stance lasts duty / f
     under = np.stack(
-        [vx[:, None] - wz[:, None] * FEET[:, 1], vy[:, None] + wz[:, None] * FEET[:, 0]], axis=-1
+        [vx[:, None] - wz[:, None] * below[:, 1], vy[:, None] + wz[:, None] * below[:, 0]], axis=-1
     )
     way = under * (duty / frequency)[:, None, None]  # (n, 4, 2), m
     way *= np.minimum(1.0, LONGEST_STEP_M / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
@@ -52,17 +50,15 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
     along = np.where(down, 1.0 - 2.0 * phases / duty[:, None], -np.cos(np.pi * swing))
     # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_command) - BEHIND_S v_command
     excess = np.clip(env.velocity[:, :2] - command[:, :2], -MAX_EXCESS, MAX_EXCESS)
-    feet = np.broadcast_to(FEET, (len(command), 4, 3)).copy()
+    feet = np.broadcast_to(below, (len(command), 4, 3)).copy()
     placed = PLACEMENT_S * excess - BEHIND_S * command[:, :2]
     feet[..., :2] += 0.5 * way * along[..., None] + placed[:, None, :]
     # z_foot = z_nominal + LIFT_M sin^2(pi s); a stance foot on the lower side of the trunk pushes
     # down: z_foot += y roll - x pitch, both extrapolated by RATE_S
     roll, pitch = (env.roll_pitch + RATE_S * env.angular_velocity[:, :2]).T[..., None]
-    level = FEET[:, 1] * roll - FEET[:, 0] * pitch
+    level = below[:, 1] * roll - below[:, 0] * pitch
     feet[..., 2] += LIFT_M * np.sin(np.pi * swing) ** 2 + level * down
     # a planned stance carries 4 / (number of planned stances) of its load on four feet
     carried = down * 4.0 / np.maximum(down.sum(axis=1, keepdims=True), 1) - 1.0
-    load = np.repeat(carried, 3, axis=1) * (env.stand_q - robot.NOMINAL_Q)
-    return np.asarray(
-        (inverse_kinematics(ALIENGO, feet) - robot.NOMINAL_Q + load) * (standing < 0.5)[:, None]
-    )
+    load = np.repeat(carried, 3, axis=1) * (env.stand_q - robot.nominal_q)
+    return np.asarray((inverse_kinematics(robot, feet) - robot.nominal_q + load) * (standing < 0.5)[:, None])

@@ -11,8 +11,6 @@ from typing import Protocol
 import attrs
 import numpy as np
 
-from quadvel_description import robot
-
 from .env import VelocityEnv
 from .gait_clock import GaitClock, foot_pace
 
@@ -264,7 +262,7 @@ class WalkingRewards:
         """Rewards of the kind of gait."""
         env, w = self.env, self.weights
         sideways = command[:, 1] - env.velocity[:, 1] - past.stride[:, 1]
-        beyond = np.maximum(env.fastest - OVERSPEED_SHARE * robot.VELOCITY_LIMIT, 0.0)
+        beyond = np.maximum(env.fastest - OVERSPEED_SHARE * env.robot.velocity_limit, 0.0)
         return {
             "off_hip": -w.off_hip * np.abs(past.off_hip).sum(axis=1),
             "sway": -w.sway * np.minimum(sideways**2, 0.1),
@@ -276,7 +274,7 @@ class WalkingRewards:
         """Rewards of standing still."""
         env, w = self.env, self.weights
         return {
-            "posture": -w.posture * np.abs(env.q - robot.NOMINAL_Q).sum(axis=1),
+            "posture": -w.posture * np.abs(env.q - env.robot.nominal_q).sum(axis=1),
             "step": -w.step * (~env.contact).sum(axis=1),
             "fidget": -w.fidget * np.minimum(np.sum(env.dq**2, axis=1), 200.0),
         }

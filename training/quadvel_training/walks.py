@@ -12,9 +12,8 @@ import attrs
 import numpy as np
 import torch
 
-from quadvel_description import robot
 from quadvel_description.command_range import clip_to_command_range
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import ALIENGO, Robot
 from quadvel_description.state import RobotState
 from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.observation import build_observation, default_observation
@@ -48,8 +47,6 @@ class Mode(IntEnum):
 
 
 _C = SupervisorConfig()
-UP, DOWN = robot.NOMINAL_Q, robot.LIE_Q
-GOAL = np.array([DOWN, DOWN, UP, UP, UP, UP, DOWN])
 MOVE_S = np.array(
     [1.0, _C.fold_time, _C.rise_time, _C.settle_time, 1.0, 1.0, _C.lie_down_time]
 )  # duration of the way to the goal
@@ -74,19 +71,22 @@ class Modes:
         kd: (n, 12), N m s/rad.
     """
 
-    def __init__(self, n: int, rng: np.random.Generator) -> None:
+    def __init__(self, robot: Robot, n: int, rng: np.random.Generator) -> None:
         """Create robots that walk.
 
         Args:
+            robot: the robot.
             n: number of robots.
             rng: source of randomness.
         """
-        self._rng = rng
+        self._rng, self._robot = rng, robot
+        up, down = robot.nominal_q, robot.lie_q
+        self._goals = np.array([down, down, up, up, up, up, down])  # by mode, rad
         self.mode = np.full(n, Mode.WALK)
         self.elapsed = np.zeros(n)
         self._until = np.zeros(n)
-        self._from = np.tile(UP, (n, 1))  # targets when the mode began
-        self.target = np.tile(UP, (n, 1))
+        self._from = np.tile(up, (n, 1))  # targets when the mode began
+        self.target = np.tile(up, (n, 1))
         self.kp, self.kd = np.zeros((n, 12)), np.zeros((n, 12))
 
     @property
@@ -97,7 +97,8 @@ class Modes:
     @property
     def previous_action(self) -> np.ndarray:
         """Targets minus the nominal posture (n, 12), rad; zeros while damping."""
-        return np.where((self.mode == Mode.DAMPING)[:, None], 0.0, clip_to_command_range(self.target) - UP)
+        targets = clip_to_command_range(self._robot, self.target) - self._robot.nominal_q
+        return np.where((self.mode == Mode.DAMPING)[:, None], 0.0, targets)
 
     def begin(self, ids: np.ndarray) -> np.ndarray:
         """Draw a first mode for some robots.
@@ -109,10 +110,10 @@ class Modes:
             rad, (len, 12), posture to start each of them in.
         """
         self.mode[ids] = self._rng.choice(len(FIRST_MODE_SHARES), len(ids), p=FIRST_MODE_SHARES)
-        self._enter(ids, GOAL[self.mode[ids]])
+        self._enter(ids, self._goals[self.mode[ids]])
         self.elapsed[ids] = np.where(self.mode[ids] == Mode.WALK, _C.blend_time, 0.0)
-        self.target[ids] = GOAL[self.mode[ids]]
-        return GOAL[self.mode[ids]]
+        self.target[ids] = self._goals[self.mode[ids]]
+        return self._goals[self.mode[ids]]
 
     def _enter(self, ids: np.ndarray, start: np.ndarray) -> None:
         """Start the present mode of some robots at the targets `start`, and draw its duration."""
@@ -136,7 +137,7 @@ class Modes:
         #     x(s) = x_0 + (10 s^3 - 15 s^4 + 6 s^5) (x_1 - x_0), s = t / T in [0, 1]
         #     dx/dt = 30 s^2 (1 - s)^2 (x_1 - x_0) / T
         s = np.clip(self.elapsed / MOVE_S[self.mode], 0.0, 1.0)[:, None]
-        way = GOAL[self.mode] - self._from
+        way = self._goals[self.mode] - self._from
         self.target = self._from + s**3 * (10 - 15 * s + 6 * s**2) * way
         speed = 30 * s**2 * (1 - s) ** 2 / MOVE_S[self.mode][:, None] * way
         self.kp[:], self.kd[:] = STAND_GAINS
@@ -198,7 +199,7 @@ class Walks:
         n = env.config.n
         self.over = np.zeros(n, bool)
         self._map = dagger.action_map(env)
-        self._modes = Modes(n, env.rng)
+        self._modes = Modes(env.robot, n, env.rng)
         self._action = np.zeros((n, 12), np.float32)
         self._memory = actor.initial_state(n)
         self._biases, self._noise = np.zeros((n, 8)), np.zeros((n, 1))
@@ -301,11 +302,18 @@ class Walks:
 
 
 def walks_on_both_grounds(
-    n: int, seed: int, commands: CommandRange, randomisation: Randomisation, rough: Terrain, actor: Recurrent
+    robot: Robot,
+    n: int,
+    seed: int,
+    commands: CommandRange,
+    randomisation: Randomisation,
+    rough: Terrain,
+    actor: Recurrent,
 ) -> tuple[Walks, Walks]:
     """Create walks on flat and on rough ground.
 
     Args:
+        robot: the robot.
         n: number of robots, of both together.
         seed: seed of all draws.
         commands: range of commands.
@@ -316,7 +324,9 @@ def walks_on_both_grounds(
     Returns:
         Walks on flat and on rough ground.
     """
-    config = EnvConfig(n=n // 2, seed=seed, commands=commands, randomisation=randomisation, episode=EPISODE)
+    config = EnvConfig(
+        robot=robot, n=n // 2, seed=seed, commands=commands, randomisation=randomisation, episode=EPISODE
+    )
     flat, uneven = (VelocityEnv(attrs.evolve(config, terrain=terrain)) for terrain in (Terrain(), rough))
     return Walks(flat, actor), Walks(uneven, actor)
 

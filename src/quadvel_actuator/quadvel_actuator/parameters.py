@@ -1,7 +1,7 @@
 """Parameters of the empirical actuator model and their YAML file.
 
-`quadvel_actuator.model` computes torques from these parameters. The shipped default is
-Table 4 of the paper.
+`quadvel_actuator.model` computes torques from these parameters. Each robot has a file; the
+AlienGo's is Table 4 of the paper.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ import yaml
 from quadvel_description.bounded_yaml import read_yaml
 from quadvel_description.fields import Numbers, field, positive, refusal
 from quadvel_description.records import structure_record
+from quadvel_description.robot import Robot
 
 SCHEMA = 1
 DEFAULT_JOINT_COUNT = 12
 PROBABLE_ERROR_RATIO = 1.5  # pairs below this multiple of the least error are probable (Section 3.1)
-
-_DEFAULT_FILE = Path(__file__).parent / "data" / "aliengo.yaml"
 
 _COMMENTS = {
     "kp_ref": "Gains at which the deviations were identified (N m/rad, N m s/rad).",
@@ -86,7 +85,7 @@ class ActuatorParameters:
     """Parameters of the empirical actuator model (Eq. 1 and 2 of the paper), in SI units.
 
     A wrong value raises a ValueError that names the field, the value found and the expected one.
-    `data/aliengo.yaml` is an example of the file.
+    `robots/aliengo/actuator.yaml` of `quadvel_description` is an example of the file.
 
     Attributes:
         schema: version of the file format, `SCHEMA`.
@@ -170,22 +169,28 @@ class ActuatorParameters:
         Path(path).write_text("\n".join(lines) + "\n")
 
     @classmethod
-    def default(cls) -> ActuatorParameters:
-        """Return the parameters of the AlienGo that ship with the package.
+    def of(cls, robot: Robot) -> ActuatorParameters:
+        """Read the parameters of a robot.
+
+        Args:
+            robot: The robot.
 
         Returns:
-            Table 4 of the paper.
+            The parameters in the robot's folder.
         """
-        return cls.load(_DEFAULT_FILE)
+        return cls.load(robot.actuator_file)
 
     @classmethod
-    def ideal(cls) -> ActuatorParameters:
+    def ideal(cls, robot: Robot) -> ActuatorParameters:
         """Return the parameters of a plain PD law.
 
+        Args:
+            robot: The robot.
+
         Returns:
-            The default without delay, gain deviation and noise; the torque limit stays.
+            Those of the robot without delay, gain deviation and noise; the torque limit stays.
         """
         at_once = DelayPair(0.0, 0.0, 0.0)
         return attrs.evolve(
-            cls.default(), name="ideal", delta_kp=0.0, delta_kd=0.0, pairs=(at_once,), torque_noise=0.0
+            cls.of(robot), name="ideal", delta_kp=0.0, delta_kd=0.0, pairs=(at_once,), torque_noise=0.0
         )

@@ -13,10 +13,9 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from . import robot
 from .arrays import Array
 from .kinematics import foot_positions, rotate, rotate_inverse, yaw
-from .robot import ALIENGO
+from .robot import Robot
 from .urdf import ROOT
 
 ODOM = "odom"
@@ -26,8 +25,7 @@ IMU = "imu_link"
 LASER = "laser"
 
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-_MOVING = tuple(link for link in robot.LINKS if link.axis)
-_AXES = np.array([{"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0)}[link.axis] for link in _MOVING if link.axis])
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0)}
 
 
 @attrs.frozen
@@ -47,39 +45,46 @@ class FramePose:
     quaternion: Array
 
 
-def fixed_links() -> list[FramePose]:
+def fixed_links(robot: Robot) -> list[FramePose]:
     """Return the poses of the links that never move in their parents.
+
+    Args:
+        robot: The robot.
 
     Returns:
         Poses, the trunk in `base_link` first.
     """
-    links = [link for link in robot.LINKS if not link.axis]
+    links = [link for link in robot.links if not link.axis]
     return [FramePose(link.parent or BASE, link.name, np.array(link.origin), _IDENTITY) for link in links]
 
 
-def moving_links(q: Array) -> list[FramePose]:
+def moving_links(robot: Robot, q: Array) -> list[FramePose]:
     """Compute the poses of hips, thighs and calves in their parent links.
 
     Args:
+        robot: The robot.
         q: Joint positions, (12,), rad.
 
     Returns:
         A pose per joint.
     """
-    quaternions = np.column_stack([np.cos(0.5 * q), np.sin(0.5 * q)[:, None] * _AXES])
+    moving = robot.joint_links
+    axes = np.array([_AXES[str(link.axis)] for link in moving])
+    quaternions = np.column_stack([np.cos(0.5 * q), np.sin(0.5 * q)[:, None] * axes])
     return [
         FramePose(str(link.parent), link.name, np.array(link.origin), quaternion)
-        for link, quaternion in zip(_MOVING, quaternions, strict=True)
+        for link, quaternion in zip(moving, quaternions, strict=True)
     ]
 
 
-def footprint(q: Array, quaternion: Array) -> FramePose:
+def footprint(robot: Robot, q: Array, quaternion: Array) -> FramePose:
     """Compute the pose of `base_footprint` in `base_link`.
 
     It lies below the robot on a level floor that the lowest foot touches, and has the robot's
     heading.
 
     Args:
+        robot: The robot.
         q: Joint positions, (12,), rad.
         quaternion: Orientation of the trunk, body to world, (4,), (w, x, y, z).
 
@@ -91,6 +96,6 @@ def footprint(q: Array, quaternion: Array) -> FramePose:
     c, s = np.cos(half), np.sin(half)
     w, x, y, z = quaternion
     tilt = np.array([c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w])
-    floor = rotate(tilt, foot_positions(ALIENGO, q))[..., 2].min() - robot.FOOT_RADIUS
+    floor = rotate(tilt, foot_positions(robot, q))[..., 2].min() - robot.foot_radius
     below = rotate_inverse(tilt, np.array([0.0, 0.0, floor]))
     return FramePose(BASE, FOOTPRINT, below, tilt * [1.0, -1.0, -1.0, -1.0])

@@ -2,9 +2,10 @@
 
 The folder of a robot, `robots/<name>` or one elsewhere, holds
 
-    robot.yaml   numbers that no model file has: postures, gains, limits, friction, the drive
-    robot.urdf   links, inertias and ranges of the joints; also shown by RViz and Foxglove
-    robot.xml    MJCF with the shapes that touch the ground, for the simulation
+    robot.yaml     numbers that no model file has: postures, gains, limits, friction, the drive
+    robot.urdf     links, inertias and ranges of the joints; also shown by RViz and Foxglove
+    robot.xml      MJCF with the shapes that touch the ground, for the simulation
+    actuator.yaml  actuator model, read by `quadvel_actuator`
 """
 
 from __future__ import annotations
@@ -195,6 +196,7 @@ class Robot:
         foot_radius: Radius of the foot spheres, m.
         drive: How its drives are reached.
         links: Links, parents before their children.
+        joint_links: Links that a joint moves, 12.
         lower: Mechanical range, (12,), rad.
         upper: Mechanical range, (12,), rad.
         mass: Mass of all links, kg.
@@ -221,10 +223,16 @@ class Robot:
     foot_radius: float = positive()
     drive: Drive
     links: tuple[Link, ...]
+    joint_links: tuple[Link, ...] = attrs.field(init=False)
     lower: Array = attrs.field(init=False)
     upper: Array = attrs.field(init=False)
     mass: float = attrs.field(init=False)
     legs: LegGeometry = attrs.field(init=False)
+
+    @joint_links.default
+    def _joint_links(self) -> tuple[Link, ...]:
+        links = {link.joint: link for link in self.links}
+        return tuple(links[name] for name in JOINT_NAMES)
 
     @lower.default
     def _lower(self) -> Array:
@@ -265,10 +273,9 @@ class Robot:
         return self.folder / "robot.xml"
 
     @property
-    def joint_links(self) -> tuple[Link, ...]:
-        """Links that a joint moves, 12, in the order of JOINT_NAMES."""
-        links = {link.joint: link for link in self.links}
-        return tuple(links[name] for name in JOINT_NAMES)
+    def actuator_file(self) -> Path:
+        """Actuator model of the simulation."""
+        return self.folder / "actuator.yaml"
 
     def combined_inertial(self, name: str) -> Inertial:
         """Compute the inertia of a moving link together with everything that is fixed to it.

@@ -160,7 +160,7 @@ class EstimatorNode(Node):
 
     def _publish_odometry(self, stamp: Any, state: RobotState, estimate: Estimate) -> None:
         """Publish x and y by dead reckoning and the orientation of the IMU; z is the height above the lowest foot."""
-        floor = footprint(state.q, state.quaternion)
+        floor = footprint(self._robot, state.q, state.quaternion)
         position = np.array([*estimate.position[:2], -rotate(state.quaternion, floor.position)[2]])
         variances = np.array([*estimate.position_deviation[:2] ** 2, HEIGHT_VARIANCE])
         message = Odometry(child_frame_id=self._settings.body_frame)

@@ -121,7 +121,7 @@ def bench_world() -> dict[str, Any]:
         Realtime factor, and time of a scan in us.
     """
     campus = World.load("campus")
-    robot = Simulator(SimulatorConfig(world=campus))
+    robot = Simulator(SimulatorConfig(robot=ALIENGO, world=campus))
     robot.reset("stand")
     command = JointCommand(q=NOMINAL_Q.copy(), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
 

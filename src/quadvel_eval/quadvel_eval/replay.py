@@ -294,7 +294,7 @@ def open_loop_error(
         ValueError: The interval holds no complete stretch.
     """
     quiet = attrs.evolve(actuator, torque_noise=0.0)
-    simulator = Simulator(SimulatorConfig(actuator=quiet, noise=SensorNoise.none()))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, actuator=quiet, noise=SensorNoise.none()))
     errors = [
         _stretch_errors(simulator, joints, truth, row)
         for row in np.searchsorted(
@@ -375,7 +375,7 @@ def predicted_tracking(
         Command and mean velocity of each command.
     """
     setup = Setup()
-    simulator = Simulator(SimulatorConfig(actuator=actuator, seed=seed))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, actuator=actuator, seed=seed))
     simulator.reset("stand")
     supervisor = Supervisor(ALIENGO, PolicyFile(ALIENGO))
     loop = RobotLoop(simulator, supervisor, make_estimator(setup.estimator, simulator, setup.estimator_file))

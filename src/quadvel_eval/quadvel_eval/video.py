@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description.arrays import Array
 from quadvel_description.mjcf import load_model
+from quadvel_description.robot import ALIENGO
 from quadvel_recordings.output import atomic_write
 
 from .demo_figures import tracking_figure
@@ -42,7 +43,7 @@ class Film:
 
     def __init__(self, recording: Recording, width: int, height: int) -> None:
         self._recording = recording
-        self._model = load_model()
+        self._model = load_model(ALIENGO)
         self._data = mujoco.MjData(self._model)
         self._renderer = mujoco.Renderer(self._model, height, width)
         self._camera = mujoco.MjvCamera()

@@ -84,7 +84,9 @@ def make_simulator(setup: Setup, seed: int) -> Simulator:
     drawn = _draw_plant(rng) if setup.randomised else {}
     if setup.actuator is not None:
         drawn["actuator"] = ActuatorParameters.load(setup.actuator)
-    simulator = Simulator(SimulatorConfig(**{"terrain": terrain, "seed": seed, **drawn, **setup.plant}))
+    simulator = Simulator(
+        SimulatorConfig(**{"robot": ALIENGO, "terrain": terrain, "seed": seed, **drawn, **setup.plant})
+    )
     simulator.reset("stand")
     if setup.randomised:
         simulator.actuator.sample(rng=rng)

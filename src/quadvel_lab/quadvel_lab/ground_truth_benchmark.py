@@ -24,6 +24,7 @@ from rich.table import Table
 from quadvel_actuator import ActuatorParameters
 from quadvel_bringup.processes import ProcessGroup, StopSignals
 from quadvel_bringup.stack import Stack
+from quadvel_description.robot import ALIENGO
 from quadvel_eval import demo_summary, replay
 from quadvel_eval.pool import Call, run_in_parallel
 from quadvel_eval.recording import Recording, read_recording
@@ -214,7 +215,7 @@ def evaluate_models(folders: Mapping[str, Path], console: Console) -> list[dict[
     Returns:
         The entries of `twin.json`.
     """
-    own = ActuatorParameters.default()
+    own = ActuatorParameters.of(ALIENGO)
     drives = [step for step in SCRIPTS[SCRIPT] if isinstance(step, Drive) and any(step.velocity)]
     commands = [(np.array(step.velocity), step.duration) for step in drives]
     calls: list[Call] = [(replay.predicted_tracking, own, commands, seed) for seed in MODEL_SEEDS]

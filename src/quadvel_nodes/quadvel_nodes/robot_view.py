@@ -52,7 +52,7 @@ class RobotView:
             node.create_publisher(String, "robot_description", LATCHED),
         ]
         stamp = node.get_clock().now().to_msg()
-        self._latched[0].publish(TFMessage(transforms=transform_messages(stamp, fixed_links())))
+        self._latched[0].publish(TFMessage(transforms=transform_messages(stamp, fixed_links(ALIENGO))))
         self._latched[1].publish(String(data=ALIENGO.urdf_file.read_text(encoding="utf-8")))
 
     def publish(self, stamp: Any, state: RobotState) -> None:
@@ -69,7 +69,7 @@ class RobotView:
             joints.effort = state.tau.tolist()
             self._joint_states.publish(joints)
         if self._tf.get_subscription_count():
-            self._tf.publish(TFMessage(transforms=transform_messages(stamp, moving_links(state.q))))
+            self._tf.publish(TFMessage(transforms=transform_messages(stamp, moving_links(ALIENGO, state.q))))
         if self._imu.get_subscription_count():
             imu = self._noise
             imu.header.stamp = stamp

@@ -50,6 +50,7 @@ class JointCommandLimiter:
 
     def __init__(self, robot: Robot, config: JointCommandLimits) -> None:
         self._config = config
+        self._robot = robot
         self._torque_limit, self._velocity_limit = robot.torque_limit, robot.velocity_limit
         self.counts: Counter[str] = Counter()
 
@@ -64,7 +65,7 @@ class JointCommandLimiter:
         if command.mode == MODE_DAMPING:
             return
         target = command.q
-        command.q, torque = split_target(target, command.kp, state.q)
+        command.q, torque = split_target(self._robot, target, command.kp, state.q)
         command.tau = command.tau + torque
         self._count("target_out_of_range", np.count_nonzero(command.q != target) > 0)
         requested = command.torque(state.q, state.dq)
@@ -73,7 +74,7 @@ class JointCommandLimiter:
         allowed = self._limit_at_top_speed(allowed, state.dq)
         allowed = self._limit_power(allowed, state.dq)
         if np.count_nonzero(allowed != requested):
-            _add_torque(command, allowed - requested)
+            _add_torque(self._robot, command, allowed - requested)
 
     def _count(self, name: str, acts: bool | np.bool_) -> None:
         if acts:
@@ -109,7 +110,7 @@ class JointCommandLimiter:
         return np.where(power > 0.0, torque * limit / total, torque)
 
 
-def _add_torque(command: JointCommand, change: Array) -> None:
+def _add_torque(robot: Robot, command: JointCommand, change: Array) -> None:
     """Change the torque of a command by `change` (12,) N m.
 
         q_des' = clamp(q_des + change / kp),   tau_ff' = tau_ff + change - kp (q_des' - q_des)
@@ -117,6 +118,6 @@ def _add_torque(command: JointCommand, change: Array) -> None:
     The target changes as far as stiffness and range allow; feed-forward torque gives the rest.
     """
     shift = np.divide(change, command.kp, out=np.zeros(12), where=command.kp > 0.0)
-    q = np.where(shift == 0.0, command.q, clip_to_command_range(command.q + shift))
+    q = np.where(shift == 0.0, command.q, clip_to_command_range(robot, command.q + shift))
     command.tau = command.tau + change - command.kp * (q - command.q)
     command.q = q

@@ -5,13 +5,15 @@ Records only: `simulator` applies them, `parameters` fills them from the paramet
 
 from __future__ import annotations
 
+from typing import Any
+
 import attrs
 import numpy as np
 
 from quadvel_actuator import ActuatorParameters
-from quadvel_description import robot
 from quadvel_description.arrays import Array
 from quadvel_description.fields import field
+from quadvel_description.robot import Robot
 from quadvel_sim.physics import Physics
 from quadvel_sim.terrain import Terrain
 from quadvel_sim.world import World
@@ -45,15 +47,21 @@ class SensorNoise:
         return cls(*(0.0 for _ in attrs.fields(cls)))
 
 
+def _of_robot(name: str) -> Any:
+    """Declare the value of the robot as a default."""
+    return attrs.Factory(lambda config: getattr(config.robot, name), takes_self=True)
+
+
 @attrs.frozen(eq=False, kw_only=True)
 class SimulatorConfig:
-    """Configuration of one simulated AlienGo; the default is the nominal robot on flat ground.
+    """Configuration of one simulated robot; the default is the nominal robot on flat ground.
 
     Raises:
         ValueError: A value is out of its range, or a world is combined with a terrain.
 
     Attributes:
-        actuator: Parameters of the actuator model; the default is the identified AlienGo (Table 4).
+        robot: The robot.
+        actuator: Parameters of the actuator model; the default is the robot's.
         terrain: Ground without a world.
         world: Obstacles, ground, people and laser around the robot; None: only `terrain`.
         noise: Sensor noise.
@@ -71,7 +79,10 @@ class SimulatorConfig:
         fall_tilt: Tilt of the trunk's z axis beyond which the robot counts as fallen, rad.
     """
 
-    actuator: ActuatorParameters = attrs.field(factory=ActuatorParameters.default)
+    robot: Robot
+    actuator: ActuatorParameters = attrs.field(
+        default=attrs.Factory(lambda config: ActuatorParameters.of(config.robot), takes_self=True)
+    )
     terrain: Terrain = attrs.field(factory=Terrain)
     world: World | None = None
     noise: SensorNoise = attrs.field(factory=SensorNoise)
@@ -79,9 +90,9 @@ class SimulatorConfig:
     friction: Array = field(0.8, size=4, at_least=0.0)
     payload: float = field(0.0, at_least=-8.0, at_most=50.0)
     payload_position: Array = field((0.0, 0.0, 0.1), size=3)
-    armature: Array = field(attrs.Factory(lambda: robot.ARMATURE), size=12, at_least=1e-4)
-    joint_friction: Array = field(attrs.Factory(lambda: robot.FRICTION), size=12, at_least=0.0)
-    joint_damping: Array = field(attrs.Factory(lambda: robot.DAMPING), size=12, at_least=0.0)
+    armature: Array = field(_of_robot("armature"), size=12, at_least=1e-4)
+    joint_friction: Array = field(_of_robot("joint_friction"), size=12, at_least=0.0)
+    joint_damping: Array = field(_of_robot("joint_damping"), size=12, at_least=0.0)
     physics: Physics = attrs.field(factory=Physics)
     suspended: bool = False
     watchdog: float = field(0.02, at_least=0.001)

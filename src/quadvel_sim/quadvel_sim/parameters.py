@@ -8,6 +8,8 @@ from typing_extensions import override
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.fields import field
+from quadvel_description.robot import Robot, load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_driver.calibration import Calibration
 from quadvel_driver.unitree_dds.bus import MAX_DOMAIN
 from quadvel_nodes.scheduling import Scheduling
@@ -18,7 +20,7 @@ from quadvel_sim.simulator import Simulator
 from quadvel_sim.terrain import KINDS, Terrain
 from quadvel_sim.world import SHIPPED_WORLDS, World
 
-_NOISE, _TERRAIN, _CONFIG = SensorNoise(), Terrain(), SimulatorConfig()
+_NOISE, _TERRAIN, _CONFIG = SensorNoise(), Terrain(), attrs.fields(SimulatorConfig)
 
 
 @attrs.frozen(kw_only=True, slots=False)  # no slots: a subclass has a second base class
@@ -31,11 +33,12 @@ class PlantParameters(Scheduling):
         ValueError: `state_rate` is no divisor of 1000 Hz or below 50 Hz.
     """
 
+    robot: str = field(DEFAULT_ROBOT, "a shipped robot, or the path of a robot.yaml")
     keyframe: str = field("lie", "posture at the start: lie or stand")
     state_rate: int = field(200, "rate of the states, Hz: a divisor of 1000, 50 at least")
     publish_tf: bool = field(False, "whether to publish the true transform from odom to base_link")
-    seed: int = field(_CONFIG.seed, "seed of sensor and torque noise")
-    actuator_file: str = field("", "actuator model, YAML; empty: the shipped AlienGo")
+    seed: int = field(_CONFIG.seed.default, "seed of sensor and torque noise")
+    actuator_file: str = field("", "actuator model, YAML; empty: the robot's")
     world: str = field(
         "", f"world around the robot: a YAML file, or {', '.join(SHIPPED_WORLDS)}; empty: none"
     )
@@ -45,15 +48,15 @@ class PlantParameters(Scheduling):
     wavelength: float = field(_TERRAIN.wavelength, "rough ground: distance from hump to hollow, m")
     terrain_seed: int = field(_TERRAIN.seed, "rough ground: its seed")
     friction: tuple[float, ...] = field(
-        tuple(_CONFIG.friction.tolist()), "sliding friction of the feet: one number, or FR, FL, RR, RL"
+        4 * (_CONFIG.friction.default,), "sliding friction of the feet: one number, or FR, FL, RR, RL"
     )
-    payload: float = field(_CONFIG.payload, "mass on the trunk, kg; negative: a lighter trunk")
+    payload: float = field(_CONFIG.payload.default, "mass on the trunk, kg; negative: a lighter trunk")
     payload_position: tuple[float, ...] = field(
-        tuple(_CONFIG.payload_position.tolist()), "centre of that mass in the trunk frame, m"
+        _CONFIG.payload_position.default, "centre of that mass in the trunk frame, m"
     )
-    hung: bool = field(_CONFIG.suspended, "whether the trunk is held in the air, as on a stand")
-    watchdog: float = field(_CONFIG.watchdog, "s without a command after which the drives brake")
-    watchdog_kd: float = field(_CONFIG.watchdog_kd, "gain of that brake, N m s/rad")
+    hung: bool = field(_CONFIG.suspended.default, "whether the trunk is held in the air, as on a stand")
+    watchdog: float = field(_CONFIG.watchdog.default, "s without a command after which the drives brake")
+    watchdog_kd: float = field(_CONFIG.watchdog_kd.default, "gain of that brake, N m s/rad")
     noise_q: float = field(_NOISE.q, "standard deviation of q, rad")
     noise_dq: float = field(_NOISE.dq, "standard deviation of dq, rad/s")
     noise_angular_velocity: float = field(_NOISE.angular_velocity, "of the gyroscope, rad/s")
@@ -93,8 +96,10 @@ class PlantParameters(Scheduling):
         Raises:
             ValueError: A parameter is out of its range, or a file cannot be read.
         """
+        robot = load_robot(self.robot)
         return SimulatorConfig(
-            actuator=self._actuator(),
+            robot=robot,
+            actuator=self._actuator(robot),
             terrain=self.make_terrain(self.terrain, self.slope),
             world=World.load(self.world) if self.world else None,
             noise=SensorNoise(
@@ -128,9 +133,9 @@ class PlantParameters(Scheduling):
         """
         return Terrain(kind, slope, self.roughness, self.wavelength, seed=self.terrain_seed)
 
-    def _actuator(self) -> ActuatorParameters:
+    def _actuator(self, robot: Robot) -> ActuatorParameters:
         if not self.actuator_file:
-            return ActuatorParameters.default()
+            return ActuatorParameters.of(robot)
         try:
             return ActuatorParameters.load(self.actuator_file)
         except OSError as error:
@@ -168,12 +173,8 @@ class SimParameters(PlantParameters):
 
 @attrs.frozen(kw_only=True)
 class BoardParameters(PlantParameters, NetworkConfig):
-    """Parameters of the node `board`: kind of robot, address and network faults."""
+    """Parameters of the node `board`: address and network faults."""
 
-    robot: str = field(
-        "aliengo",
-        "whose packets, a name or the path of a robot.yaml; the physics are the AlienGo's",
-    )
     state_rate: int = field(1000, "rate of the states, Hz: a divisor of 1000, 50 at least")
     address: str = field("127.0.0.1", "IP address on which the board listens")
     port: int = field(8007, "UDP port on which the board listens; 0: any that is free")

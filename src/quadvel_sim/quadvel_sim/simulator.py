@@ -1,4 +1,4 @@
-"""Simulation of one AlienGo in MuJoCo: joint commands in, low-level state out. No ROS, no clock.
+"""Simulation of one robot in MuJoCo: joint commands in, low-level state out. No ROS, no clock.
 
 The actuator model (`ActuatorModel`) is evaluated every millisecond with the joint state of that
 instant and the active command.
@@ -95,7 +95,7 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
         plane=False,
         suspended=config.suspended,
     )
-    spec = build_spec(plant)
+    spec = build_spec(config.robot, plant)
     if config.world is None:
         config.terrain.add_to(spec)
     else:
@@ -145,13 +145,13 @@ class Simulator:
         actuator: Model of the drives.
     """
 
-    def __init__(self, config: SimulatorConfig | None = None) -> None:
+    def __init__(self, config: SimulatorConfig) -> None:
         """Compile the model and reset the robot.
 
         Args:
-            config: Configuration; None: the nominal robot on flat ground.
+            config: Configuration.
         """
-        self.config = config or SimulatorConfig()
+        self.config = config
         self.model = build_model(self.config)
         self.data = mujoco.MjData(self.model)
         self._q, self._dq = self.data.qpos[7:], self.data.qvel[6:]  # views of the live arrays

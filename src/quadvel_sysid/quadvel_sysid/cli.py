@@ -19,6 +19,7 @@ from typer.core import TyperCommand
 from typing_extensions import override
 
 from quadvel_actuator.parameters import ActuatorParameters
+from quadvel_description.robot import ALIENGO
 from quadvel_recordings.output import output_folder
 
 from .logs.check_log import CheckedLog, check_logs
@@ -175,7 +176,7 @@ def identify(
         return_freed_arrays_to_system()
         names = ColumnMap() if columns is None else ColumnMap.load(columns)
         read = partial(read_log, joints=joints, names=names, topics=Topics(state_topic, command_topic))
-        parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
+        parameters = ActuatorParameters.of(ALIENGO) if base is None else ActuatorParameters.load(base)
         options = IdentifyOptions(gains=gains, base=parameters, robot=robot)
         found = _identify(logs, holdout or [], read, options, cores, messages)
         _write(found, out, force, messages)

@@ -60,7 +60,7 @@ class Excitation(ABC):
         Returns:
             (n, 12) targets, rad, one row every `PERIOD_S`.
         """
-        return limit_speed(clip_to_command_range(self._joint_targets(self._times())))
+        return limit_speed(clip_to_command_range(ALIENGO, self._joint_targets(self._times())))
 
     def support_torque(self) -> Array:
         """Compute the feed-forward torque that carries the robot on its feet.

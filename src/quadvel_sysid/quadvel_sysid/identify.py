@@ -15,6 +15,7 @@ import attrs
 import numpy as np
 
 from quadvel_actuator.parameters import ActuatorParameters
+from quadvel_description.robot import ALIENGO
 
 from .data.clocks import known_offsets
 from .data.dataset import Dataset, Progress, no_progress
@@ -115,7 +116,7 @@ def identify_dataset(
 def _identify_once(dataset: Dataset, options: IdentifyOptions, progress: Progress) -> Identification:
     """Identify the actuators from one division of the logs."""
     # 1. Samples, data split and plain EAM.
-    base = options.base or ActuatorParameters.default()
+    base = options.base or ActuatorParameters.of(ALIENGO)
     load = find_load(dataset, options.robot)
     progress(0.02, "gains and delays")
     prepared, notes = _preprocess(dataset, load, options.search)

@@ -108,7 +108,7 @@ class Scene:
             self._base.position, self._base.wxyz = (0.0, 0.0, height), picture.quaternion
             self._world.position = (-x, -y, -self._floor - standing)
             self._grid.position = (-x % 1.0, -y % 1.0, -standing)
-            for placed in moving_links(picture.q):
+            for placed in moving_links(self._robot, picture.q):
                 self._links[placed.child].wxyz = placed.quaternion
             self._draw_world(picture)
 

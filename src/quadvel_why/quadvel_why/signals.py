@@ -65,7 +65,7 @@ class Trained:
         """
         recipe = policy.metadata.recipe if isinstance(policy.metadata.recipe, dict) else {}
         ranges = recipe.get("configuration", {}).get("randomisation", {})
-        drives = ActuatorParameters.default()
+        drives = ActuatorParameters.of(ALIENGO)
         longest = max(p.input_delay_s + p.output_delay_s for p in drives.probable_pairs)
         kp, kd = np.mean(drives.delta_kp), np.mean(drives.delta_kd)
         return cls(

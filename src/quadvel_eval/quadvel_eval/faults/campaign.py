@@ -148,7 +148,7 @@ def run_case(case: Case, seed: int) -> FaultRun:
 
 def _prepare_stack(mode: str, rng: np.random.Generator, seed: int) -> Stack:
     """Bring a robot to a random instant of a mode."""
-    simulator = Simulator(SimulatorConfig(seed=seed))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, seed=seed))
     simulator.reset("lie" if mode == "stand_up" else "stand")
     policy, estimator = _networks()
     policy.reset()

@@ -110,7 +110,9 @@ class Tour:
 
     def __init__(self, setup: TourSetup) -> None:
         self.setup, self.world = setup, World.load(setup.world)
-        self.simulator = Simulator(SimulatorConfig(world=self.world, seed=setup.seed, **setup.plant))
+        self.simulator = Simulator(
+            SimulatorConfig(robot=ALIENGO, world=self.world, seed=setup.seed, **setup.plant)
+        )
         self.simulator.reset("stand")
         supervisor = Supervisor(ALIENGO, PolicyFile(ALIENGO, setup.policy), backup=KalmanEstimator(ALIENGO))
         estimator = make_estimator(setup.estimator, self.simulator, setup.estimator_file)

@@ -13,6 +13,7 @@ from typing_extensions import override
 
 from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import ALIENGO
 from quadvel_recordings.output import atomic_write
 
 from .cells import Command, cell_record, command_limits, count_falls, largest_error, mean_error
@@ -32,12 +33,12 @@ def _default_with_effect(
 ) -> ActuatorParameters:
     """The shipped actuator model with an effect on all joints."""
     effect = Effect(name, JOINT_NAMES, {**(settings or {}), **parameters})
-    return attrs.evolve(ActuatorParameters.default(), name=f"aliengo with {name}", effects=(effect,))
+    return attrs.evolve(ActuatorParameters.of(ALIENGO), name=f"aliengo with {name}", effects=(effect,))
 
 
 def _default_with_extra_delay() -> ActuatorParameters:
     """The shipped actuator model with commands that take MORE_DELAY longer."""
-    default = ActuatorParameters.default()
+    default = ActuatorParameters.of(ALIENGO)
     pairs = tuple(attrs.evolve(p, input_delay_s=p.input_delay_s + EXTRA_DELAY_S) for p in default.pairs)
     return attrs.evolve(default, name="aliengo with more delay", pairs=pairs)
 
@@ -49,7 +50,7 @@ def drive_conditions() -> list[Condition]:
         One condition per plant.
     """
     drives = {
-        "as in training": ActuatorParameters.default(),
+        "as in training": ActuatorParameters.of(ALIENGO),
         "friction": _default_with_effect("stribeck_friction", c=1.2, c_s=1.8, v_s=0.3, v_0=0.05),
         "torque-speed limit": _default_with_effect("torque_speed_limit", stall=24.0, no_load=12.0),
         "3 ms more delay": _default_with_extra_delay(),

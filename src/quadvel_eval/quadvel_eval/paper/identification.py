@@ -101,7 +101,7 @@ def record_foot_lifting(seed: int, seconds: float) -> Log:
     Returns:
         The log.
     """
-    simulator = RecordingSimulator(SimulatorConfig(seed=seed))
+    simulator = RecordingSimulator(SimulatorConfig(robot=ALIENGO, seed=seed))
     simulator.reset("stand")
     start, targets = simulator.state().q, FootLifting(seconds).targets()[::SIMULATOR_STEPS_PER_TICK]
     kp, kd = np.full(12, robot.KP), np.full(12, robot.KD)
@@ -125,7 +125,7 @@ def record_mixed_walk(setup: Setup, seed: int, bounds: VelocityCommandLimits) ->
     Returns:
         The log.
     """
-    simulator = RecordingSimulator(SimulatorConfig(**{"seed": seed, **setup.plant}))
+    simulator = RecordingSimulator(SimulatorConfig(**{"robot": ALIENGO, "seed": seed, **setup.plant}))
     simulator.reset("stand")
     estimator = make_estimator(setup.estimator, simulator, setup.estimator_file)
     loop = RobotLoop(simulator, Supervisor(ALIENGO, PolicyFile(ALIENGO, setup.policy)), estimator)

@@ -26,7 +26,7 @@ from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf
 from quadvel_description.arrays import Array, Bools
-from quadvel_description.robot import shipped_robots
+from quadvel_description.robot import load_robot, shipped_robots
 
 from ..data.log_signals import as_double
 from ..logs.log import Log, LogError
@@ -35,7 +35,6 @@ _WARM_UP_S = 0.04
 """s of measured motion before a stretch, which fill the model's delays and memories."""
 _STEP_S = 0.001
 """s; time step of the replay."""
-_SHIPPED = Path(mjcf.__file__).parent / "robots"
 
 
 @attrs.frozen(eq=False)
@@ -68,7 +67,7 @@ class Legs:
             ValueError: A joint is missing, or MuJoCo cannot read the file.
             FileNotFoundError: There is no such description.
         """
-        model = mjcf.load_model() if robot == "aliengo" else _load_robot(robot)
+        model = _load_robot(robot)
         known = {model.joint(k).name for k in range(model.njnt)}
         for name in joints:
             if name not in known:
@@ -151,8 +150,9 @@ class Legs:
 
 def _load_robot(robot: str) -> mujoco.MjModel:
     """Load a shipped description, or a file."""
-    shipped = _SHIPPED / robot / "robot.xml"
-    path = shipped if shipped.is_file() else Path(robot)
+    if robot in shipped_robots():
+        return mjcf.load_model(load_robot(robot))
+    path = Path(robot)
     if not path.is_file():
         names = ", ".join(shipped_robots())
         raise FileNotFoundError(f"--robot: found {robot}, expected {names} or an MJCF or URDF file")
