@@ -7,15 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_description.robot import Robot, load_robot
+from quadvel_description.robot import Robot
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
 from quadvel_driver.dry_run import DryRun
 from quadvel_driver.link import Link, LinkConfig
 from quadvel_driver.unitree_dds import wire as dds_wire
-from tests.helpers.robots import ALIENGO
-
-GO2 = load_robot("go2")
+from tests.helpers.robots import ALIENGO, GO2
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ import attrs
 import numpy as np
 import pytest
 
-from quadvel_description.robot import load_robot
 from quadvel_description.state import JointCommand
 from quadvel_driver.board_state import Battery, BoardState
 from quadvel_driver.link import SHUTDOWN_PACKETS, Link, LinkConfig, Transport
@@ -16,10 +15,9 @@ from quadvel_driver.takeover import Access
 from quadvel_driver.unitree_dds import takeover, wire
 from quadvel_driver.unitree_dds.motion_switcher import Answer, Api
 from quadvel_driver.unitree_dds.takeover import DdsTakeover
+from tests.helpers.robots import GO2
 
 from .test_dds_wire import some_state
-
-GO2 = load_robot("go2")
 
 TURN_S = 0.01
 SHORT_TURN_S = 0.002  # the link's own

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_description.robot import load_robot
 from quadvel_description.state import JointCommand
 from quadvel_driver.board_state import BoardState
 from quadvel_driver.link import Link, LinkConfig, LinkError
@@ -33,9 +32,7 @@ from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.dds_board import DdsBoard
 from quadvel_sim.simulator import Simulator
 from tests.helpers import boards
-from tests.helpers.robots import ALIENGO
-
-GO2 = load_robot("go2")
+from tests.helpers.robots import ALIENGO, GO2
 
 DOMAIN, INTERFACE = int(os.environ["ROS_DOMAIN_ID"]), "lo"
 PATIENCE_S = 40.0

@@ -13,6 +13,7 @@ from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_view.operator import Operator
 from quadvel_view.panel import panel
 from quadvel_view.picture import TOPICS, Ground, RobotPicture
+from tests.helpers.robots import ALIENGO
 
 from .conftest import message, odometry
 
@@ -21,7 +22,7 @@ STATE = "quadvel_msgs/msg/ControllerState"
 
 
 def test_joints_are_taken_by_their_names() -> None:
-    picture = RobotPicture()
+    picture = RobotPicture(ALIENGO)
     names = list(reversed(JOINT_NAMES))
     angles, torques = np.linspace(0.0, 1.1, 12), np.linspace(5.0, -6.0, 12)
     joints = message("sensor_msgs/msg/JointState", name=names, position=angles, effort=torques)
@@ -31,7 +32,7 @@ def test_joints_are_taken_by_their_names() -> None:
 
 
 def test_a_scan_lies_where_laser_and_robot_are() -> None:
-    picture = RobotPicture()
+    picture = RobotPicture(ALIENGO)
     picture.update("/odom", odometry(10.0, 5.0), 0.0)
     laser = message("geometry_msgs/msg/TransformStamped", child_frame_id="laser")
     laser.header.frame_id = "base_link"
@@ -51,7 +52,7 @@ def test_a_scan_lies_where_laser_and_robot_are() -> None:
 
 
 def test_the_way_behind_has_a_point_every_few_centimetres() -> None:
-    picture = RobotPicture()
+    picture = RobotPicture(ALIENGO)
     for x in np.arange(0.0, 1.0, 0.01):
         picture.update("/odom", odometry(x, 0.0), 0.0)
     steps = np.diff(np.array(picture.trail)[:, 0])
@@ -60,7 +61,7 @@ def test_the_way_behind_has_a_point_every_few_centimetres() -> None:
 
 
 def test_low_state_counts_where_nothing_better_comes() -> None:
-    picture = RobotPicture()
+    picture = RobotPicture(ALIENGO)
     low = message("quadvel_msgs/msg/LowState", q=np.full(12, 0.3, np.float32))
     low.orientation_wxyz = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
     picture.update("/low_state", low, 0.0)
@@ -72,7 +73,7 @@ def test_low_state_counts_where_nothing_better_comes() -> None:
 
 
 def test_a_fault_is_the_first_lamp_and_a_silent_node_is_told() -> None:
-    picture = RobotPicture()
+    picture = RobotPicture(ALIENGO)
     state = message("quadvel_msgs/msg/ControllerState", mode_name="fault", fault="tilted", reason="it fell")
     status = message("diagnostic_msgs/msg/DiagnosticStatus", name="estimator", message="estimating", level=0)
     other = message("diagnostic_msgs/msg/DiagnosticStatus", name="controller", message="fine", level=0)
@@ -86,7 +87,7 @@ def test_a_fault_is_the_first_lamp_and_a_silent_node_is_told() -> None:
 
 
 def test_feet_stand_on_the_ground_that_there_is() -> None:
-    picture = RobotPicture()
+    picture = RobotPicture(ALIENGO)
     assert picture.ground_below_feet()[1] == pytest.approx(
         0.0, abs=1e-3
     )  # in the nominal posture at the nominal height
@@ -109,7 +110,7 @@ def test_the_ground_between_its_corners_is_the_plane_through_them() -> None:
 
 
 def test_numbers_that_are_not_there_are_none_and_the_rest_is_shown() -> None:
-    picture = RobotPicture()
+    picture = RobotPicture(ALIENGO)
     for _ in range(2):  # before the first message, and with one whose numbers are not there yet
         readings = json.loads(json.dumps(panel(picture, Operator(), 0.0), allow_nan=False))
         assert readings["measured"] == readings["commanded"] == [None] * 3
@@ -125,7 +126,7 @@ def test_numbers_that_are_not_there_are_none_and_the_rest_is_shown() -> None:
 
 
 def test_readings_of_a_silent_robot_are_not_there() -> None:
-    picture = RobotPicture()
+    picture = RobotPicture(ALIENGO)
     joints = message("sensor_msgs/msg/JointState", name=list(JOINT_NAMES), position=np.zeros(12))
     joints.effort = np.ones(12)
     picture.update("/joint_states", joints, 0.0)
@@ -158,7 +159,7 @@ def _cyclic(picture: RobotPicture) -> None:
     ],
 )  # fmt: skip
 def test_a_message_that_makes_no_sense_is_refused_and_told(topic: str, make: Callable[[str], Any]) -> None:
-    picture = RobotPicture()
+    picture = RobotPicture(ALIENGO)
     picture.update_lazily(topic, lambda: make(TOPICS[topic]), 0.0)
     lamps = panel(picture, Operator(), 0.0)["lamps"]
     assert [lamp["name"] for lamp in lamps] == [topic]
@@ -173,7 +174,7 @@ def _marker(kind: int, **fields: Any) -> Any:
 
 
 def test_frames_that_go_round_in_circles_do_not_keep_the_page() -> None:
-    picture = RobotPicture()
+    picture = RobotPicture(ALIENGO)
     _cyclic(picture)
     scan = message("sensor_msgs/msg/LaserScan", ranges=np.ones(3, np.float32), range_max=9.0)
     scan.header.frame_id = "a"
@@ -182,7 +183,7 @@ def test_frames_that_go_round_in_circles_do_not_keep_the_page() -> None:
 
 
 def test_the_way_behind_ends_where_odometry_starts_again() -> None:
-    picture = RobotPicture()
+    picture = RobotPicture(ALIENGO)
     for x in np.arange(0.0, 0.9, 0.06):
         odom = odometry(x, 0.0)
         odom.pose.covariance = np.full(36, (0.1 * x) ** 2)
@@ -195,7 +196,7 @@ def test_the_way_behind_ends_where_odometry_starts_again() -> None:
 
 
 def test_commands_that_come_late_and_a_pad_that_is_not_followed_are_told() -> None:
-    picture, operator = RobotPicture(), Operator()
+    picture, operator = RobotPicture(ALIENGO), Operator()
     picture.update("/command", message("quadvel_msgs/msg/VelocityCommand", source="planner"), 0.0)
     operator.hold(1, (0.5, 0.0, 0.0), 0.0)
     assert panel(picture, operator, 0.1)["notices"] == []
@@ -211,7 +212,7 @@ def test_commands_that_come_late_and_a_pad_that_is_not_followed_are_told() -> No
 
 
 def test_a_stopped_robot_says_why_it_does_not_move() -> None:
-    picture, operator = RobotPicture(), Operator()
+    picture, operator = RobotPicture(ALIENGO), Operator()
     operator.stop()
     for mode, reason in (
         ("walk", "STOP is latched; the joints are not damped yet"),

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.writer import Writer
 
+from quadvel_description.robot import load_robot
+from quadvel_recordings.definitions import STORE
 from quadvel_recordings.reading import RecordingError
 from quadvel_view.page_protocol import Pace, Seek, Stop
 from quadvel_view.playback import Playback
 from quadvel_view.replay import execute
 
-from .conftest import SECONDS, SPEED
+from .conftest import SECONDS, SPEED, message
 
 
 def test_it_plays_at_its_pace_and_ends(walked: Path) -> None:
@@ -70,3 +73,26 @@ def test_a_recording_without_a_robot_is_refused(tmp_path: Path) -> None:
         writer.finish()
     with pytest.raises(RecordingError, match="not a recording of a robot"):
         Playback(path)
+
+
+def test_the_robot_is_the_one_that_the_recording_names(tmp_path: Path, walked: Path) -> None:
+    path, go2 = tmp_path / "go2.mcap", load_robot("go2")
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        for topic, one in {
+            "/robot_description": message("std_msgs/msg/String", data=go2.urdf_file.read_text()),
+            "/joint_states": message(
+                "sensor_msgs/msg/JointState", name=["FR_hip_joint"], position=np.zeros(1)
+            ),
+        }.items():
+            text, _ = STORE.generate_msgdef(one.__msgtype__, ros_version=2)
+            schema = writer.register_schema(one.__msgtype__, "ros2msg", text.encode())
+            data = bytes(STORE.serialize_cdr(one, one.__msgtype__))
+            writer.add_message(writer.register_channel(topic, "cdr", schema), 0, data, 0)
+        writer.finish()
+    assert Playback(path).picture.robot is go2
+    assert Playback(walked).picture.robot is load_robot("aliengo")
+    assert Playback(walked, "go2").picture.robot is go2
+    with pytest.raises(ValueError, match=r"go2\.mcap: robot is 'go2', expected 'aliengo'"):
+        Playback(path, "aliengo")

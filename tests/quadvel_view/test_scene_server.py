@@ -22,6 +22,7 @@ from quadvel_view.access_control import is_loopback
 from quadvel_view.scene_server import SceneServer, SceneServerError, client_page
 from quadvel_view.server import AddressError
 from quadvel_view.viewer import Viewer
+from tests.helpers.robots import ALIENGO
 
 VISER = [Subprotocol(f"viser-v{viser.__version__}")]
 
@@ -96,7 +97,7 @@ def test_a_folder_for_temporary_files_whose_name_is_too_long_for_a_socket_is_nam
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     with pytest.raises(AddressError, match=r"x{100}.*TMPDIR"):
-        Viewer("127.0.0.1", 0, lambda *_: None, lambda _: None)
+        Viewer(ALIENGO, "127.0.0.1", 0, lambda *_: None, lambda _: None)
     assert list(folder.iterdir()) == []
 
 

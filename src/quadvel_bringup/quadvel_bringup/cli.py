@@ -329,6 +329,14 @@ def view(
         Path | None,
         typer.Argument(help="A recording to play: MCAP, rosbag2.", show_default=False),
     ] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            metavar="<name|file>",
+            help="aliengo, go2 or a robot.yaml.",
+            show_default="as recorded, or aliengo",
+        ),
+    ] = None,
     host: Annotated[
         str,
         typer.Option(
@@ -355,7 +363,7 @@ def view(
     check_installed("view", "quadvel_view", "view")
     from .view import view as run_view
 
-    run_view(recording, host, port, foxglove)
+    run_view(recording, robot, host, port, foxglove)
 
 
 @app.command(rich_help_panel=ROBOT)

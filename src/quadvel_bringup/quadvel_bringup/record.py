@@ -13,6 +13,7 @@ from rich.console import Console
 
 import quadvel_dds
 from quadvel_recordings.output import output_file, output_folder
+from quadvel_recordings.reading import DESCRIPTION_TOPIC
 
 from .exclusivity import ros_domain
 from .processes import StopSignals
@@ -24,7 +25,9 @@ AFTER_FAULT_S = 3.0
 
 
 def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
-    """Record topics until Ctrl-C or for a duration. Without any message no file is written.
+    """Record topics, and the robot's description, until Ctrl-C or for a duration.
+
+    Without any message no file is written.
 
     Args:
         path: The file to write.
@@ -57,13 +60,13 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
     ):
         try:
             while not signals.received and (left := ends - time.monotonic()) > 0.0:
-                recorder.record_all(wanted)
+                recorder.record_all(_with_description(wanted))
                 recorder.serve(session.executor, min(DISCOVERY_PERIOD_S, left))
                 status.update(f"{_summary(recorder.counts)}; Ctrl-C stops")
         except OSError as error:
             written = f"after {_summary(recorder.counts)}; about the last second of them is unreadable"
             raise OSError(f"{path}: the recording ended {written}: {error.strerror}") from error
-    if not recorder.counts:
+    if not recorder.counts.keys() - {DESCRIPTION_TOPIC}:
         path.unlink()
         sought = ", ".join(wanted) or "any topic"
         console.print(
@@ -115,7 +118,7 @@ def record_faults(folder: Path, topics: Sequence[str], before: float, seconds: f
     ):
         session.node.create_subscription(ControllerState, "controller/state", faults.on_state, 10)
         while not signals.received and (left := ends - time.monotonic()) > 0.0:
-            recorder.record_all(wanted)
+            recorder.record_all(_with_description(wanted))
             recorder.serve(session.executor, min(DISCOVERY_PERIOD_S, left))
             if faults.is_due:
                 save()
@@ -185,6 +188,11 @@ class FaultTrigger:
 def _absolute(topics: Sequence[str]) -> list[str]:
     """Return topics with a leading slash, as the graph names them."""
     return [topic if topic.startswith("/") else f"/{topic}" for topic in topics]
+
+
+def _with_description(topics: Sequence[str]) -> list[str]:
+    """Return the topics and that of the robot's description; all topics if none are given."""
+    return [*topics, DESCRIPTION_TOPIC] if topics else []
 
 
 def _end(seconds: float | None) -> float:

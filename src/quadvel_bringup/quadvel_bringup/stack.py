@@ -148,7 +148,8 @@ class Stack:
         Returns:
             Arguments by name of the node.
         """
-        nodes = self.node_parameters() | ({VIEW: {}} if view else {})
+        robot = _given(robot=_absolute_file(self.robot))
+        nodes = self.node_parameters() | ({VIEW: robot} if view else {})
         return {name: ros_arguments(name, values, self.parameters) for name, values in nodes.items()}
 
     def commands(self, view: bool = False) -> dict[str, list[str]]:

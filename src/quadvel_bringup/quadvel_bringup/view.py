@@ -10,11 +10,12 @@ from . import nodes
 from .processes import StopSignals
 
 
-def view(recording: Path | None, host: str, port: int | None, for_foxglove: bool) -> None:
+def view(recording: Path | None, robot: str | None, host: str, port: int | None, for_foxglove: bool) -> None:
     """Serve the page, or the topics for Foxglove, until Ctrl-C.
 
     Args:
         recording: A recording to play, or None for the running robot.
+        robot: Name or file of the robot; None for that of the recording, or the default one.
         host: Address to listen on.
         port: TCP port, or None for the default one.
         for_foxglove: Whether to serve Foxglove instead of the page.
@@ -36,7 +37,11 @@ def view(recording: Path | None, host: str, port: int | None, for_foxglove: bool
         serve(host, foxglove_live.DEFAULT_PORT if port is None else port)
         return
     if recording is None:
-        given = {"host": host} | ({} if port is None else {"port": port})
+        given = (
+            {"host": host}
+            | ({} if port is None else {"port": port})
+            | ({} if robot is None else {"robot": robot})
+        )
         nodes.run("view", nodes.ros_arguments("view", given))
         return
     from quadvel_view.replay import replay
@@ -44,4 +49,4 @@ def view(recording: Path | None, host: str, port: int | None, for_foxglove: bool
 
     with StopSignals() as signals:
         chosen = DEFAULT_PORT if port is None else port
-        replay(recording, host, chosen, signals.wait, lambda url: print(f"open {url}", flush=True))
+        replay(recording, robot, host, chosen, signals.wait, lambda url: print(f"open {url}", flush=True))

@@ -22,6 +22,7 @@ from .fields import field, positive, refusal, to_array
 from .inertia import Inertial, combine_inertials
 from .quadruped import JOINT_NAMES, LEGS
 from .records import read_document, structure_record
+from .robot_name import UNNAMED_ROBOT
 from .symmetry import mirror_joints
 from .urdf import read_links
 
@@ -61,6 +62,29 @@ def load_robot(robot: str) -> Robot:
     fields = read_document(file, "a YAML file of a robot", SCHEMA)
     links = read_links(file.parent / "robot.urdf")
     return structure_record(Robot, {**fields, "links": links, "folder": str(file.parent)}, file)
+
+
+def robot_of_file(path: Path, named: str | None, asked: str | None) -> Robot:
+    """Load the robot of a recording or another file.
+
+    Args:
+        path: The file.
+        named: Name of the robot in the file, or None.
+        asked: Name or file of the robot that was asked for, or None for that of the file.
+
+    Returns:
+        The robot that was asked for, else the one that the file names, else UNNAMED_ROBOT.
+
+    Raises:
+        ValueError: The file names another robot than the one that was asked for.
+        FileNotFoundError: There is no such robot.
+    """
+    if asked is None:
+        return load_robot(named or UNNAMED_ROBOT)
+    robot = load_robot(asked)
+    if named not in (None, robot.name):
+        raise ValueError(f"{path}: robot is {named!r}, expected {robot.name!r}")
+    return robot
 
 
 def _per_joint(value: Any) -> Any:

@@ -26,6 +26,10 @@ STORAGES = {".mcap": "mcap", ".db3": "sqlite3"}
 """Storage identifiers of metadata.yaml by suffix of the file."""
 
 
+DESCRIPTION_TOPIC = "/robot_description"
+"""Topic of the robot's URDF, by which a recording names its robot."""
+
+
 class RecordingError(ValueError):
     """A recording is unreadable; the sentence names the file."""
 
@@ -105,6 +109,25 @@ def topics(path: Path) -> dict[str, str]:
     for _ in lazy_messages(path, look, lambda _: None):
         pass
     return found
+
+
+def recorded_description(path: Path) -> str:
+    """Read the URDF of the robot from the topic `robot_description`.
+
+    Args:
+        path: As for `read_messages`; it raises the same errors.
+
+    Returns:
+        The XML, "" if none was recorded.
+    """
+    described = lazy_messages(
+        path,
+        lambda topic, kind: topic.endswith(DESCRIPTION_TOPIC) and kind == "std_msgs/msg/String",
+        lambda _: None,
+    )
+    for _, _, message in described:
+        return str(message().data)
+    return ""
 
 
 def _recording_files(path: Path, notify: Callable[[str], None] | None) -> Sequence[Path]:

@@ -6,8 +6,6 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from quadvel_description import robot
-
 from .operator import BRAKING_MODES, PUBLISH_PERIOD_S, Operator
 from .picture import FRESH_S, RobotPicture
 
@@ -39,7 +37,7 @@ def panel(picture: RobotPicture, operator: Operator, now: float) -> dict[str, An
         "source": picture.source if picture.is_fresh("/command", now) else "",
         "commanded": _rounded(picture.commanded, alive),
         "measured": _rounded(picture.measured, picture.is_fresh("/odom", now)),
-        "torque": _rounded(picture.torque / robot.TORQUE_LIMIT, picture.has_fresh_joints(now)),
+        "torque": _rounded(picture.torque / picture.robot.torque_limit, picture.has_fresh_joints(now)),
         "loop": _loop_timing(picture.state) if alive else {},
         "lamps": _lamps(picture, alive),
         "simulated": any(name in picture.nodes for name in ("sim_node", "board")),

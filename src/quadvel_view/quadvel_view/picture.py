@@ -9,11 +9,10 @@ from typing import Any
 import attrs
 import numpy as np
 
-from quadvel_description import robot
 from quadvel_description.arrays import Array
 from quadvel_description.kinematics import foot_positions, rotate
 from quadvel_description.quadruped import joint_index
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot
 
 TOPICS = {
     "/joint_states": "sensor_msgs/msg/JointState",
@@ -143,9 +142,12 @@ class RobotPicture:
         rejected: Error of the newest message of a topic, if it was invalid.
     """
 
-    q: Array = attrs.field(factory=lambda: np.array(robot.NOMINAL_Q))
+    robot: Robot
+    q: Array = attrs.Factory(lambda self: np.array(self.robot.nominal_q), takes_self=True)
     torque: Array = attrs.field(factory=lambda: np.zeros(12))
-    position: Array = attrs.field(factory=lambda: np.array([0.0, 0.0, robot.NOMINAL_HEIGHT]))
+    position: Array = attrs.Factory(
+        lambda self: np.array([0.0, 0.0, self.robot.nominal_height]), takes_self=True
+    )
     quaternion: Array = attrs.field(factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
     measured: Array = attrs.field(factory=lambda: np.zeros(3))
     commanded: Array = attrs.field(factory=lambda: np.zeros(3))
@@ -224,10 +226,10 @@ class RobotPicture:
         Returns:
             Height of the ground in the frame odom, m, and height of the foot above it, m.
         """
-        feet = rotate(self.quaternion, foot_positions(ALIENGO, self.q)) + self.position
+        feet = rotate(self.quaternion, foot_positions(self.robot, self.q)) + self.position
         x, y, z = feet[feet[:, 2].argmin()]
         floor = 0.0 if self.ground is None else self.ground.height(x, y)
-        return floor, float(z) - robot.FOOT_RADIUS - floor
+        return floor, float(z) - self.robot.foot_radius - floor
 
     def silence(self, topic: str, now: float) -> float:
         """Return the time since the last message of a topic.

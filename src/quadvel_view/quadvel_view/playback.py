@@ -10,7 +10,9 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Array
-from quadvel_recordings.reading import RecordingError, lazy_messages
+from quadvel_description.robot import robot_of_file
+from quadvel_description.robot_name import described_robot
+from quadvel_recordings.reading import RecordingError, lazy_messages, recorded_description
 
 from .picture import LOW_STATE, TOPICS, RobotPicture
 
@@ -45,6 +47,10 @@ class _Track:
 class Playback:
     """A recording that plays from its start.
 
+    Args:
+        path: The recording.
+        robot: Name or file of the robot; None for the one that the recording names.
+
     Attributes:
         name: Name of the file.
         length: Duration, s.
@@ -54,15 +60,16 @@ class Playback:
         time: Present time, s since the start.
 
     Raises:
-        RecordingError: The file is not a recording of a robot. OSError for a missing file passes
-            through.
+        RecordingError: The file is not a recording of a robot. OSError for a missing file, and
+            ValueError for one of another robot, pass through.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, robot: str | None = None) -> None:
         self.name = path.name
         self._tracks = _load(path)
         self.length = max(float(track.times[-1]) for track in self._tracks.values())
-        self.picture = RobotPicture()
+        named = described_robot(recorded_description(path))
+        self.picture = RobotPicture(robot_of_file(path, named, robot))
         self.playing, self.pace, self.time = True, 1.0, 0.0
         self.seek(0.0)
 

@@ -14,12 +14,18 @@ from .viewer import FRAME_PERIOD_S, Viewer
 
 
 def replay(
-    path: Path, host: str, port: int, is_over: Callable[[float], bool], announce: Callable[[str], None]
+    path: Path,
+    robot: str | None,
+    host: str,
+    port: int,
+    is_over: Callable[[float], bool],
+    announce: Callable[[str], None],
 ) -> None:
     """Serve the page and play the recording while a page is open.
 
     Args:
         path: A recording of a robot.
+        robot: Name or file of the robot; None for the one that the recording names.
         host: Address to listen on.
         port: TCP port, 0 for a free one.
         is_over: Waits for the given time (s) and returns whether to end.
@@ -28,9 +34,9 @@ def replay(
         Errors pass through: RecordingError, OSError, and AddressError if the address is
         unavailable.
     """
-    playback = Playback(path)
+    playback = Playback(path, robot)
     words: SimpleQueue[PageMessage] = SimpleQueue()
-    viewer = Viewer(host, port, lambda page, word: words.put(word), lambda page: None)
+    viewer = Viewer(playback.picture.robot, host, port, lambda page, word: words.put(word), lambda page: None)
     idle = Operator()
     try:
         announce(viewer.url)

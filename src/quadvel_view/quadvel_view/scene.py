@@ -14,9 +14,9 @@ import numpy as np
 import trimesh
 import viser
 
-from quadvel_description import robot
 from quadvel_description.arrays import Array
 from quadvel_description.frames import moving_links
+from quadvel_description.robot import Robot
 
 from .picture import Ground, Person, RobotPicture
 
@@ -62,9 +62,10 @@ class Scene:
 
     Args:
         server: The viser server.
+        robot: The robot.
     """
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, robot: Robot) -> None:
         self._server, scene = server, server.scene
         scene.set_up_direction("+z")
         server.initial_camera.position = CAMERA_POSITION_M
@@ -73,6 +74,7 @@ class Scene:
         _configure_appearance(server)
         self._world = scene.add_frame("/world", show_axes=False)
         self._base = scene.add_frame("/robot", show_axes=False)
+        self._robot = robot
         self._links = self._add_links()
         self._grid = scene.add_grid(
             "/grid",
@@ -100,12 +102,13 @@ class Scene:
         floor, above = picture.ground_below_feet()
         self._floor += LIFT_SMOOTHING * (floor - self._floor)
         self._drift += LIFT_SMOOTHING * (above - self._drift)
-        height = z - self._drift - self._floor - robot.NOMINAL_HEIGHT
+        standing = self._robot.nominal_height
+        height = z - self._drift - self._floor - standing
         with self._server.atomic():
             self._base.position, self._base.wxyz = (0.0, 0.0, height), picture.quaternion
-            self._world.position = (-x, -y, -self._floor - robot.NOMINAL_HEIGHT)
-            self._grid.position = (-x % 1.0, -y % 1.0, -robot.NOMINAL_HEIGHT)
-            for placed in moving_links(robot.ALIENGO, picture.q):
+            self._world.position = (-x, -y, -self._floor - standing)
+            self._grid.position = (-x % 1.0, -y % 1.0, -standing)
+            for placed in moving_links(self._robot, picture.q):
                 self._links[placed.child].wxyz = placed.quaternion
             self._draw_world(picture)
 
@@ -172,10 +175,10 @@ class Scene:
     def _add_links(self) -> dict[str, Any]:
         """Add a frame per moving link in that of its parent, with the meshes of the link."""
         scene, names, frames = self._server.scene, {"base_link": "/robot"}, {}
-        for link in robot.LINKS:
+        for link in self._robot.links:
             names[link.name] = f"{names[link.parent or 'base_link']}/{link.name}"
             frames[link.name] = scene.add_frame(names[link.name], show_axes=False, position=link.origin)
-        for number, shape in enumerate(robot_shapes()):
+        for number, shape in enumerate(robot_shapes(self._robot)):
             scene.add_mesh_simple(
                 f"{names[shape.link]}/shape_{number}",
                 shape.mesh.vertices,
@@ -185,13 +188,16 @@ class Scene:
         return frames
 
 
-def robot_shapes() -> Iterator[Shape]:
+def robot_shapes(robot: Robot) -> Iterator[Shape]:
     """Yield the visual shapes of the robot's URDF.
+
+    Args:
+        robot: The robot.
 
     Yields:
         One shape per visual element.
     """
-    for link in ElementTree.parse(robot.ALIENGO.urdf_file).iter("link"):
+    for link in ElementTree.parse(robot.urdf_file).iter("link"):
         for visual in link.iter("visual"):
             geometry = visual.find("geometry/*")
             assert geometry is not None

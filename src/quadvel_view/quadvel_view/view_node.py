@@ -21,6 +21,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 
 from quadvel_description.fields import field
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_msgs.srv import Push, ResetSim, SetMode
 from quadvel_nodes.node import StartError, read_parameters, run
 from quadvel_recordings.definitions import STORE
@@ -47,11 +49,13 @@ class ViewParameters:
     """Parameters of the node.
 
     Attributes:
+        robot: Name of the robot, or path of a robot.yaml.
         host: Address of the page's server.
         port: TCP port of the page, 0 for a free one.
         record_folder: Folder for recordings.
     """
 
+    robot: str = field(DEFAULT_ROBOT, "the robot: its name, or the path of a robot.yaml")
     host: str = field(
         "127.0.0.1", "address on which the page is served; others than this host's need the token"
     )
@@ -67,7 +71,8 @@ class View(Node):
     def __init__(self) -> None:
         super().__init__("view")
         settings = read_parameters(self, ViewParameters)
-        self._picture, self._operator = RobotPicture(), Operator()
+        robot = load_robot(settings.robot)
+        self._picture, self._operator = RobotPicture(robot), Operator()
         self._pending: dict[str, deque[bytes]] = {}
         self._status_text, self._stop_sent_at = "", 0.0
         self._recording = PageRecorder(settings.record_folder)
@@ -80,7 +85,7 @@ class View(Node):
         for topic, typename in TOPICS.items():
             self._subscribe(topic, typename)
         try:
-            self._viewer = Viewer(settings.host, settings.port, self._on_message, self._on_disconnect)
+            self._viewer = Viewer(robot, settings.host, settings.port, self._on_message, self._on_disconnect)
         except AddressError as error:
             raise StartError(str(error)) from None
         steady = Clock(clock_type=ClockType.STEADY_TIME)

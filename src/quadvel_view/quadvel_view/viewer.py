@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from quadvel_description.robot import Robot
+
 from .operator import Operator
 from .page_protocol import PageMessage
 from .panel import panel
@@ -25,6 +27,7 @@ class Viewer:
     """Serves the page from construction until `close`.
 
     Args:
+        robot: The robot.
         host: Address to listen on.
         port: TCP port, 0 for a free one.
         on_message: Receives the number of a page and its message, in the server's thread.
@@ -36,6 +39,7 @@ class Viewer:
 
     def __init__(
         self,
+        robot: Robot,
         host: str,
         port: int,
         on_message: Callable[[int, PageMessage], None],
@@ -46,7 +50,7 @@ class Viewer:
         except SceneServerError as error:
             raise AddressError(f"the scene cannot be drawn: {error}") from None
         try:
-            self._scene = Scene(self._scene_server.viser)
+            self._scene = Scene(self._scene_server.viser, robot)
             self._page = PageServer(host, port, self._scene_server.path, on_message, on_disconnect)
         except BaseException:
             self._scene_server.close()
