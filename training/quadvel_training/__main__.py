@@ -169,7 +169,7 @@ def train_ablation(
 def _actuator_file(path: Path) -> Path:
     """Check an actuator file given as an option."""
     try:
-        ActuatorParameters.load(path)
+        ActuatorParameters.load(ALIENGO, path)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
     return path
