@@ -11,7 +11,6 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver import wire
 from quadvel_driver.board_state import BoardState, Remote
@@ -27,7 +26,7 @@ def standing(tick: int, remote: Remote = NO_REMOTE) -> BoardState:
     robot = RobotState(
         time=0.0,
         tick=tick,
-        q=np.array(NOMINAL_Q),
+        q=np.array(ALIENGO.nominal_q),
         dq=np.zeros(12),
         tau=np.zeros(12),
         quaternion=np.array([1.0, 0.0, 0.0, 0.0]),

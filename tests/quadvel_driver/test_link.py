@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_description.robot import COMMAND_UPPER, NOMINAL_Q, TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_description.state import MODE_SERVO, JointCommand
 from quadvel_driver import wire
 from quadvel_driver.link import SHUTDOWN_PACKETS, LinkError, clamp_for_board
@@ -23,7 +22,7 @@ HELD = {"command_timeout": 0.5}  # long enough for a machine that is busy
 
 
 def hold(tick: int = 0, kp: float = 100.0) -> JointCommand:
-    return JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, kp), kd=np.full(12, 3.0), tick=tick)
+    return JointCommand(q=np.array(ALIENGO.nominal_q), kp=np.full(12, kp), kd=np.full(12, 3.0), tick=tick)
 
 
 def brakes(command: JointCommand, kd: float = 5.0) -> bool:
@@ -237,6 +236,6 @@ def test_an_address_that_is_none_is_told_in_one_sentence() -> None:
 def test_nothing_beyond_the_robots_limits_is_sent() -> None:
     wild = JointCommand(*(np.full(12, 1e6) for _ in range(3)), kp=np.full(12, 50.0), kd=np.ones(12))
     sent = clamp_for_board(wild, ALIENGO)
-    np.testing.assert_array_equal(sent.q, COMMAND_UPPER)
-    np.testing.assert_array_equal(sent.dq, VELOCITY_LIMIT)
-    np.testing.assert_array_equal(sent.tau, TORQUE_LIMIT)
+    np.testing.assert_array_equal(sent.q, ALIENGO.command_upper)
+    np.testing.assert_array_equal(sent.dq, ALIENGO.velocity_limit)
+    np.testing.assert_array_equal(sent.tau, ALIENGO.torque_limit)

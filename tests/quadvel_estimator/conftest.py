@@ -16,7 +16,6 @@ from onnx import TensorProto, helper, numpy_helper
 
 import quadvel_dds
 from quadvel_description.quadruped import GRAVITY
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_estimator import features
 from tests.helpers.robots import ALIENGO
@@ -36,7 +35,7 @@ def standing() -> Callable[..., RobotState]:
         still = RobotState(
             time=time,
             tick=round(1e3 * time),
-            q=NOMINAL_Q,
+            q=ALIENGO.nominal_q,
             dq=np.zeros(12),
             tau=np.zeros(12),
             quaternion=np.array([1.0, 0.0, 0.0, 0.0]),

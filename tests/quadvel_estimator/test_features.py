@@ -7,7 +7,6 @@ import pytest
 
 from quadvel_description.network_input import InputLayout
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_estimator import features
 from tests.helpers.robots import ALIENGO
@@ -20,7 +19,7 @@ def some_state() -> RobotState:
     return RobotState(
         time=1.0,
         tick=5,
-        q=NOMINAL_Q + 0.01 * np.arange(1, 13),
+        q=ALIENGO.nominal_q + 0.01 * np.arange(1, 13),
         dq=np.arange(1.0, 13.0),
         tau=np.arange(-6.0, 6.0),
         quaternion=np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]),

@@ -9,14 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from quadvel_description.kinematics import foot_jacobians, foot_positions, inverse_kinematics, rotation_matrix
 from quadvel_description.quadruped import GRAVITY
-from quadvel_description.robot import FOOT_RADIUS, MASS, NOMINAL_HEIGHT, NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator, _ground_force
 from quadvel_estimator.odometry import leg_velocity
 from tests.helpers.robots import ALIENGO
 
 DT = 0.005
-NOMINAL_FEET = foot_positions(ALIENGO, NOMINAL_Q)
+NOMINAL_FEET = foot_positions(ALIENGO, ALIENGO.nominal_q)
 CONFIG = KalmanConfig(
     accelerometer=1.0,
     foot_position=0.003,
@@ -36,11 +35,11 @@ def rolling_stance(speed: float, time: np.ndarray) -> np.ndarray:
 
     A foot's centre moves forward by the radius times the calf's turn; solved by iteration (a contraction).
     """
-    q = np.tile(NOMINAL_Q, (len(time), 1))
+    q = np.tile(ALIENGO.nominal_q, (len(time), 1))
     feet = np.tile(NOMINAL_FEET, (len(time), 1, 1))
     for _ in range(10):
-        turn = q[:, 1::3] + q[:, 2::3] - NOMINAL_Q[1] - NOMINAL_Q[2]
-        feet[..., 0] = NOMINAL_FEET[:, 0] - speed * time[:, None] + FOOT_RADIUS * turn
+        turn = q[:, 1::3] + q[:, 2::3] - ALIENGO.nominal_q[1] - ALIENGO.nominal_q[2]
+        feet[..., 0] = NOMINAL_FEET[:, 0] - speed * time[:, None] + ALIENGO.foot_radius * turn
         q = inverse_kinematics(ALIENGO, feet)
     return q
 
@@ -95,7 +94,7 @@ def test_at_rest_noise_leaves_no_bias(standing: State) -> None:
     states = [
         standing(
             DT * i,
-            q=NOMINAL_Q + rng.normal(0.0, 0.002, 12),
+            q=ALIENGO.nominal_q + rng.normal(0.0, 0.002, 12),
             dq=rng.normal(0.0, 0.1, 12),
             linear_acceleration=np.array([0.0, 0.0, GRAVITY]) + rng.normal(0.0, 0.3, 3),
         )
@@ -112,7 +111,10 @@ def test_the_accelerometer_carries_it_through_a_flight(standing: State) -> None:
     run(estimator, [standing(DT * i) for i in range(100)])
     ballistic = [
         standing(
-            0.5 + DT * i, foot_force=airborne, linear_acceleration=np.array([1.0, 0.0, 0.0]), q=NOMINAL_Q
+            0.5 + DT * i,
+            foot_force=airborne,
+            linear_acceleration=np.array([1.0, 0.0, 0.0]),
+            q=ALIENGO.nominal_q,
         )
         for i in range(20)
     ]
@@ -141,7 +143,7 @@ def test_one_foot_that_slips_is_not_believed(standing: State) -> None:
 def test_each_leg_tells_the_velocity_that_lets_its_contact_point_rest(standing: State) -> None:
     """Against finite differences of the material point of the foot that touches the ground."""
     rng = np.random.default_rng(2)
-    q = NOMINAL_Q + rng.uniform(-0.3, 0.3, 12)
+    q = ALIENGO.nominal_q + rng.uniform(-0.3, 0.3, 12)
     dq, omega = rng.normal(size=12), rng.normal(size=3)
     attitude = Rotation.from_euler("ZYX", [1.0, 0.3, -0.2])
     state = standing(0.0, q=q, dq=dq, angular_velocity=omega, quaternion=attitude.as_quat(scalar_first=True))
@@ -152,7 +154,7 @@ def test_each_leg_tells_the_velocity_that_lets_its_contact_point_rest(standing: 
         return Rotation.from_euler("XY", [hip, thigh + knee])
 
     for leg in range(4):
-        fixed_in_calf = (attitude * calf(q, leg)).inv().apply([0.0, 0.0, -FOOT_RADIUS])
+        fixed_in_calf = (attitude * calf(q, leg)).inv().apply([0.0, 0.0, -ALIENGO.foot_radius])
 
         def contact(h: float, leg: int = leg, fixed: np.ndarray = fixed_in_calf) -> np.ndarray:
             moved = q + h * dq
@@ -165,10 +167,10 @@ def test_each_leg_tells_the_velocity_that_lets_its_contact_point_rest(standing: 
 
 def test_joint_torques_tell_the_weight_on_each_foot() -> None:
     rng = np.random.default_rng(3)
-    q = NOMINAL_Q + rng.uniform(-0.2, 0.2, 12)
+    q = ALIENGO.nominal_q + rng.uniform(-0.2, 0.2, 12)
     attitude = Rotation.from_euler("ZYX", [0.5, 0.2, 0.1])
     rotation = rotation_matrix(attitude.as_quat(scalar_first=True))
-    share = np.array([0.4, 0.1, 0.2, 0.3]) * MASS * GRAVITY
+    share = np.array([0.4, 0.1, 0.2, 0.3]) * ALIENGO.mass * GRAVITY
     force = np.column_stack([rng.normal(0.0, 20.0, (4, 2)), share])  # on the feet, world frame
     power = 1e-6 * np.eye(12)  # virtual displacements of the joints do the work of the forces on the feet
     shifts = (
@@ -179,8 +181,8 @@ def test_joint_torques_tell_the_weight_on_each_foot() -> None:
 
 
 def test_standing_on_torques_alone_works_without_foot_sensors(standing: State) -> None:
-    load = np.array([0.0, 0.0, MASS * GRAVITY / 4])
-    tau = -np.einsum("fij,i->fj", foot_jacobians(ALIENGO, NOMINAL_Q), load).reshape(12)
+    load = np.array([0.0, 0.0, ALIENGO.mass * GRAVITY / 4])
+    tau = -np.einsum("fij,i->fj", foot_jacobians(ALIENGO, ALIENGO.nominal_q), load).reshape(12)
     config = attrs.evolve(CONFIG, contact_source="torque")
     estimator = KalmanEstimator(ALIENGO, config)
     states = [standing(DT * i, tau=tau, foot_force=np.zeros(4)) for i in range(100)]
@@ -256,4 +258,4 @@ def test_a_noise_of_zero_is_refused_by_name() -> None:
 
 def test_standing_height_of_the_closed_form_is_the_nominal_one() -> None:
     """The level ground that the trot above rolls on is where the nominal posture puts it."""
-    assert FOOT_RADIUS - NOMINAL_FEET[0, 2] == pytest.approx(NOMINAL_HEIGHT, abs=1e-4)
+    assert ALIENGO.foot_radius - NOMINAL_FEET[0, 2] == pytest.approx(ALIENGO.nominal_height, abs=1e-4)

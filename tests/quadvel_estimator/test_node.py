@@ -20,7 +20,6 @@ from rclpy.executors import SingleThreadedExecutor
 from tf2_msgs.msg import TFMessage
 
 from quadvel_description.kinematics import foot_positions
-from quadvel_description.robot import FOOT_RADIUS, NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator import estimator, features
 from quadvel_msgs.msg import LowCmd, LowState
@@ -95,7 +94,7 @@ def test_each_state_is_answered_with_the_network_s_velocity(
     bench: Bench, standing: State, weights: np.ndarray
 ) -> None:
     command = LowCmd()
-    write_low_cmd(JointCommand(q=NOMINAL_Q + 0.2), command)
+    write_low_cmd(JointCommand(q=ALIENGO.nominal_q + 0.2), command)
     bench.commands.publish(command)
     for i in range(5):
         state = bench.send(3.0 + 0.005 * i)
@@ -150,7 +149,7 @@ def test_height_is_that_above_the_feet_and_said_to_be_unknown(bench: Bench, stan
     bench.wait(lambda: len(bench.heard["odom"]) == 10)
     assert abs(bench.heard["velocity_estimate"][-1].twist.twist.linear.z) > 0.5  # 0.1 m in this time
     odom = bench.heard["odom"][-1]
-    height = FOOT_RADIUS - foot_positions(ALIENGO, standing(0.0).q)[:, 2].min()
+    height = ALIENGO.foot_radius - foot_positions(ALIENGO, standing(0.0).q)[:, 2].min()
     assert odom.pose.pose.position.z == pytest.approx(height, abs=1e-6)
     variances = np.reshape(odom.pose.covariance, (6, 6)).diagonal()
     assert variances[2] > 1e5 > max(variances[:2])

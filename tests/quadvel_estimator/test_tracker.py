@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
 from quadvel_estimator import features
 from quadvel_estimator.tracker import MAX_STALE_STATES, VelocityTracker
@@ -163,8 +162,8 @@ def test_the_estimator_sees_the_targets_in_force(
     tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
     tracker.process(standing(0.0))
-    tracker.set_previous_action(features.previous_action(ALIENGO, NOMINAL_Q + 0.1, MODE_SERVO))
+    tracker.set_previous_action(features.previous_action(ALIENGO, ALIENGO.nominal_q + 0.1, MODE_SERVO))
     tracker.process(standing(0.005))
-    tracker.set_previous_action(features.previous_action(ALIENGO, NOMINAL_Q + 0.1, MODE_DAMPING))
+    tracker.set_previous_action(features.previous_action(ALIENGO, ALIENGO.nominal_q + 0.1, MODE_DAMPING))
     tracker.process(standing(0.010))
     np.testing.assert_allclose(estimator.actions, np.array([np.zeros(12), np.full(12, 0.1), np.zeros(12)]))

@@ -17,7 +17,6 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 import quadvel_dds
-from quadvel_description.robot import KD, KP, NOMINAL_Q
 from quadvel_policy.observation import PolicyMetadata, default_observation
 from tests.helpers.robots import ALIENGO
 
@@ -37,10 +36,10 @@ def make_metadata(**changes: Any) -> PolicyMetadata:
         "robot": "aliengo",
         "nominal_q": tuple(ALIENGO.nominal_q),
         "observation": default_observation(ALIENGO),
-        "action_offset": tuple(NOMINAL_Q + 0.1),
+        "action_offset": tuple(ALIENGO.nominal_q + 0.1),
         "action_scale": 0.25,
-        "kp": KP,
-        "kd": KD,
+        "kp": ALIENGO.kp,
+        "kd": ALIENGO.kd,
         "command_limits": {"vx": (-1.0, 1.5), "vy": (-0.5, 0.5), "wz": (-1.0, 1.0)},
         "state_shape": (1, 1, HIDDEN),
         "commit": "test",

@@ -8,7 +8,6 @@ from typing import Any
 import attrs
 import numpy as np
 
-from quadvel_description.robot import LIE_Q
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_nodes.parameters import make_record
 from quadvel_policy.config import SupervisorConfig
@@ -34,7 +33,7 @@ class Rig:
         zeros = np.zeros(12)
         upright, down = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 9.81])
         self.state = RobotState(
-            100.0, 0, LIE_Q.copy(), zeros, zeros, upright, np.zeros(3), down, np.full(4, 60.0)
+            100.0, 0, ALIENGO.lie_q.copy(), zeros, zeros, upright, np.zeros(3), down, np.full(4, 60.0)
         )
         self.velocity: Any = np.zeros(3)
         self.inputs: dict[str, Any] = {}  # further fields of TickInput

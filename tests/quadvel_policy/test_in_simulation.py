@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from quadvel_description import mjcf
-from quadvel_description.robot import KP, LIE_Q, NOMINAL_HEIGHT, NOMINAL_Q
 from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import TickInput
@@ -28,18 +27,18 @@ class Stand:
         self, make_policy: Any, slope: float = 0.0, heading: float = 0.0, auto_stand: bool = True
     ) -> None:
         """slope, heading: rad; where the heading is zero the robot looks uphill."""
-        sag = mjcf.gravity_torque(mjcf.load_model(ALIENGO)) / KP
+        sag = mjcf.gravity_torque(mjcf.load_model(ALIENGO)) / ALIENGO.kp
         terrain = Terrain("slope", slope=slope)
         self.simulator = Simulator(SimulatorConfig(robot=ALIENGO, terrain=terrain))
         turned = np.array([np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2)])
         quaternion = np.zeros(4)
         mujoco.mju_mulQuat(quaternion, terrain.tilt, turned)
         self.simulator.set_state(
-            attrs.evolve(self.simulator.truth(), quaternion=quaternion), LIE_Q, np.zeros(12)
+            attrs.evolve(self.simulator.truth(), quaternion=quaternion), ALIENGO.lie_q, np.zeros(12)
         )
         self.supervisor = Supervisor(
             ALIENGO,
-            make_policy(action_offset=tuple(NOMINAL_Q + sag)),
+            make_policy(action_offset=tuple(ALIENGO.nominal_q + sag)),
             SupervisorConfig(auto_stand=auto_stand),
         )
         self.torques: list[np.ndarray] = []
@@ -65,10 +64,10 @@ def stand(make_policy: Any) -> Stand:
 def test_it_stands_up_walks_on_command_and_lies_down_without_a_jump_of_torque(stand: Stand) -> None:
     stand.run(2.5)
     assert stand.supervisor.mode == "stance", stand.supervisor.reason
-    assert stand.height == pytest.approx(NOMINAL_HEIGHT, abs=0.03)
+    assert stand.height == pytest.approx(ALIENGO.nominal_height, abs=0.03)
     stand.run(0.4, STEP_IN_PLACE)  # not longer: on soft gains a posture alone does not balance the robot
     assert stand.supervisor.mode == "walk", stand.supervisor.reason
-    assert stand.height == pytest.approx(NOMINAL_HEIGHT, abs=0.03)
+    assert stand.height == pytest.approx(ALIENGO.nominal_height, abs=0.03)
     stand.run(0.1)
     assert stand.supervisor.request("lie_down") == (True, "mode is lie_down")
     stand.run(1.5)
@@ -102,7 +101,7 @@ def test_it_comes_to_rest_in_stance_with_its_feet_somewhat_off_their_places(
     stand = Stand(make_policy, auto_stand=False)
     stand.simulator.reset("stand")
     off = np.random.default_rng(seed).uniform(-0.15, 0.15, 12)
-    stand.simulator.set_state(stand.simulator.truth(), NOMINAL_Q + off, np.zeros(12))
+    stand.simulator.set_state(stand.simulator.truth(), ALIENGO.nominal_q + off, np.zeros(12))
     stand.run(0.01)
     assert stand.supervisor.request("stance")[0]
     stand.run(2.0)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from quadvel_description.kinematics import foot_positions, rotate
-from quadvel_description.robot import LIE_Q, NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_policy.modes import ModeInput, Posture, blend, vertical_offset
 from tests.helpers.robots import ALIENGO
@@ -47,8 +46,8 @@ def test_a_blend_from_damping_fades_the_gains_in() -> None:
 
 
 def test_a_blend_of_two_commands_without_gains_is_finite() -> None:
-    nothing = blend(JointCommand(), JointCommand(q=NOMINAL_Q.copy()), 0.5)
-    np.testing.assert_array_equal(nothing.q, NOMINAL_Q)
+    nothing = blend(JointCommand(), JointCommand(q=ALIENGO.nominal_q.copy()), 0.5)
+    np.testing.assert_array_equal(nothing.q, ALIENGO.nominal_q)
     np.testing.assert_array_equal(nothing.kp, np.zeros(12))
 
 
@@ -56,17 +55,22 @@ def test_a_posture_starts_with_the_torque_of_the_mode_before() -> None:
     rng = np.random.default_rng(2)
     before = some_command(rng)
     q = rng.normal(size=12)
-    posture = Posture(ALIENGO, [(1.0, NOMINAL_Q)], kp=100.0, kd=3.0)
+    posture = Posture(ALIENGO, [(1.0, ALIENGO.nominal_q)], kp=100.0, kd=3.0)
     posture.enter(tick_at(0.0, q, before))
     first = posture.tick(tick_at(0.0, q, before))
     np.testing.assert_allclose(first.kp * (first.q - q), before.kp * (before.q - q) + before.tau, atol=1e-9)
 
 
 def test_a_posture_passes_its_waypoints_at_rest_and_holds_the_last() -> None:
-    posture = Posture(ALIENGO, [(0.8, LIE_Q), (1.2, NOMINAL_Q)], kp=100.0, kd=3.0)
+    posture = Posture(ALIENGO, [(0.8, ALIENGO.lie_q), (1.2, ALIENGO.nominal_q)], kp=100.0, kd=3.0)
     start = np.zeros(12)
     posture.enter(tick_at(0.0, start, JointCommand.damping()))
-    for elapsed, expected in ((0.0, start), (0.8, LIE_Q), (2.0, NOMINAL_Q), (9.0, NOMINAL_Q)):
+    for elapsed, expected in (
+        (0.0, start),
+        (0.8, ALIENGO.lie_q),
+        (2.0, ALIENGO.nominal_q),
+        (9.0, ALIENGO.nominal_q),
+    ):
         command = posture.tick(tick_at(elapsed, start, JointCommand.damping()))
         np.testing.assert_allclose(command.q, expected, atol=1e-12)
         np.testing.assert_allclose(command.dq, 0.0, atol=1e-12)
@@ -77,9 +81,9 @@ def test_a_posture_passes_its_waypoints_at_rest_and_holds_the_last() -> None:
 @pytest.mark.parametrize("axis", [(1.0, 0.0), (0.0, 1.0), (0.6, -0.8)])
 def test_on_a_slope_a_posture_keeps_the_feet_below_the_trunk(axis: tuple[float, float]) -> None:
     tilt = 0.25
-    state = tick_at(0.0, NOMINAL_Q, JointCommand.damping()).state
+    state = tick_at(0.0, ALIENGO.nominal_q, JointCommand.damping()).state
     state.quaternion = np.array([np.cos(tilt / 2), *(np.sin(tilt / 2) * np.array(axis)), 0.0])
-    posture = Posture(ALIENGO, [(1.0, NOMINAL_Q)], kp=100.0, kd=3.0)
+    posture = Posture(ALIENGO, [(1.0, ALIENGO.nominal_q)], kp=100.0, kd=3.0)
     feet = foot_positions(ALIENGO, posture.final_posture(state))
     np.testing.assert_allclose(feet[:, 2], -0.4, atol=1e-4)  # no leg shorter than before
     middle = rotate(state.quaternion, feet.mean(axis=0))
@@ -87,13 +91,13 @@ def test_on_a_slope_a_posture_keeps_the_feet_below_the_trunk(axis: tuple[float, 
 
 
 def test_a_posture_leans_by_at_most_20_degrees() -> None:
-    state = tick_at(0.0, NOMINAL_Q, JointCommand.damping()).state
+    state = tick_at(0.0, ALIENGO.nominal_q, JointCommand.damping()).state
     state.quaternion = np.array([np.cos(0.5), 0.0, np.sin(0.5), 0.0])  # 1 rad
     assert np.linalg.norm(vertical_offset(state)) == pytest.approx(np.tan(0.35))
 
 
 def test_the_speed_of_a_posture_is_the_derivative_of_its_path() -> None:
-    posture = Posture(ALIENGO, [(0.8, LIE_Q), (1.2, NOMINAL_Q)], kp=100.0, kd=3.0)
+    posture = Posture(ALIENGO, [(0.8, ALIENGO.lie_q), (1.2, ALIENGO.nominal_q)], kp=100.0, kd=3.0)
     posture.enter(tick_at(0.0, np.zeros(12), JointCommand.damping()))
 
     def at(elapsed: float) -> JointCommand:

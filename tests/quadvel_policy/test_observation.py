@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.symmetry import mirror_observation
 from quadvel_policy.observation import (
     ActionMap,
@@ -96,9 +95,9 @@ def test_the_mirrored_robot_sees_the_mirrored_observation() -> None:
 
 def test_targets_are_offset_plus_scale_times_the_clipped_action() -> None:
     action = np.array([0.1, -0.2, 9.0] * 4)
-    plain = ActionMap(NOMINAL_Q, 0.25, clip=2.0).targets(action)
+    plain = ActionMap(ALIENGO.nominal_q, 0.25, clip=2.0).targets(action)
     np.testing.assert_allclose(plain[:3], [0.025, 0.6435 - 0.05, -1.287 + 0.5])
-    pair = ActionMap(NOMINAL_Q, 0.25, clip=(-0.1, 1.0)).targets(np.stack([action, -action]))
+    pair = ActionMap(ALIENGO.nominal_q, 0.25, clip=(-0.1, 1.0)).targets(np.stack([action, -action]))
     np.testing.assert_allclose(pair[0, :3], [0.025, 0.6435 - 0.025, -1.287 + 0.25])
     np.testing.assert_allclose(pair[1, :3], [-0.025, 0.6435 + 0.05, -1.287 - 0.025])
 

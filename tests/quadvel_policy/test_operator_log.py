@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import RobotState
 from quadvel_policy.operator_log import OperatorLog
 from quadvel_policy.supervisor import Supervisor
@@ -32,7 +31,15 @@ class Run:
             zeros, upright = np.zeros(12), np.array([1.0, 0.0, 0.0, 0.0])
             time = 0.005 * self._ticks
             state = RobotState(
-                time, 5 * self._ticks, NOMINAL_Q, zeros, zeros, upright, zeros[:3], zeros[:3], zeros[:4]
+                time,
+                5 * self._ticks,
+                ALIENGO.nominal_q,
+                zeros,
+                zeros,
+                upright,
+                zeros[:3],
+                zeros[:3],
+                zeros[:4],
             )
             self.supervisor.tick(TickInput(time, state, np.zeros(3), command))
             sentences += self.log.changes()

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from rig import FORWARD, STILL, Rig, assert_damping
 
-from quadvel_description.robot import COMMAND_UPPER, LIE_Q, NOMINAL_Q, TORQUE_LIMIT, UPPER
 from quadvel_description.state import MODE_SERVO
 from quadvel_nodes.parameters import make_record, parameter_fields
 from quadvel_policy.config import SupervisorConfig
@@ -47,17 +46,19 @@ def test_it_starts_passive_and_brakes(rig: Rig) -> None:
 
 
 def test_standing_up_goes_through_lying_to_the_nominal_posture(rig: Rig) -> None:
-    rig.state.q = np.full(12, 0.1) + LIE_Q
+    rig.state.q = np.full(12, 0.1) + ALIENGO.lie_q
     rig.tick()
     rig.supervisor.request("stand_up")
     rig.tick()
-    np.testing.assert_allclose(rig.answer.q, np.minimum(LIE_Q + 0.1, COMMAND_UPPER), atol=1e-6)
+    np.testing.assert_allclose(
+        rig.answer.q, np.minimum(ALIENGO.lie_q + 0.1, ALIENGO.command_upper), atol=1e-6
+    )
     rig.run(0.8)
-    np.testing.assert_allclose(rig.answer.q, LIE_Q, atol=1e-4)
+    np.testing.assert_allclose(rig.answer.q, ALIENGO.lie_q, atol=1e-4)
     rig.run(1.205)
     assert rig.mode == "stance"
     rig.run(0.3)
-    np.testing.assert_allclose(rig.answer.q, NOMINAL_Q, atol=1e-9)
+    np.testing.assert_allclose(rig.answer.q, ALIENGO.nominal_q, atol=1e-9)
     np.testing.assert_array_equal(rig.answer.kp, np.full(12, 150.0))
     np.testing.assert_array_equal(rig.answer.kd, np.full(12, 4.0))
 
@@ -85,7 +86,7 @@ def test_a_leg_that_does_not_follow_ends_standing_up(rig: Rig) -> None:
     rig.tick()
     rig.supervisor.request("stand_up")
     for _ in range(450):
-        rig.tick(q=LIE_Q)
+        rig.tick(q=ALIENGO.lie_q)
     assert rig.mode == "fault"
     assert re.search(
         r"standing up failed: .* is [+-]1\.\d+ rad off the nominal posture", rig.supervisor.reason
@@ -102,7 +103,7 @@ def test_a_velocity_starts_walking_from_stance_at_once(rig: Rig) -> None:
 
 
 def test_walking_waits_until_the_posture_is_reached(rig: Rig) -> None:
-    rig.state.q = NOMINAL_Q + 0.2
+    rig.state.q = ALIENGO.nominal_q + 0.2
     rig.tick()
     assert rig.supervisor.request("stance")[0]
     rig.tick(STILL)
@@ -249,7 +250,7 @@ def test_lying_down_ends_passive(rig: Rig) -> None:
     assert rig.supervisor.request("lie_down")[0]
     rig.run(0.95)
     assert rig.mode == "lie_down"
-    np.testing.assert_allclose(rig.answer.q, LIE_Q, atol=5e-3)
+    np.testing.assert_allclose(rig.answer.q, ALIENGO.lie_q, atol=5e-3)
     rig.run(0.1)
     assert rig.mode == "passive"
     assert rig.supervisor.reason == "lies"
@@ -271,7 +272,7 @@ def test_walking_ends_in_a_posture_only_when_the_robot_stands(rig: Rig) -> None:
     assert rig.supervisor.request("stance")[0]
     rig.run(0.4)
     assert rig.mode == "stance"
-    np.testing.assert_allclose(rig.answer.q, NOMINAL_Q)
+    np.testing.assert_allclose(rig.answer.q, ALIENGO.nominal_q)
 
 
 def test_a_standing_robot_may_go_to_stance_at_once_and_a_lying_one_may_not(rig: Rig) -> None:
@@ -279,7 +280,7 @@ def test_a_standing_robot_may_go_to_stance_at_once_and_a_lying_one_may_not(rig: 
     accepted, sentence = rig.supervisor.request("stance")
     assert not accepted
     assert "off the nominal posture" in sentence
-    rig.state.q = NOMINAL_Q + 0.05
+    rig.state.q = ALIENGO.nominal_q + 0.05
     rig.tick()
     assert rig.supervisor.request("stance")[0]
 
@@ -392,11 +393,11 @@ def test_the_policy_is_reset_on_entry_on_a_fault_and_after_a_gap(rig: Rig) -> No
 
 
 def test_targets_stay_in_the_range_of_commands(make_policy: Callable[..., Any]) -> None:
-    rig = Rig(make_policy(nominal_q=tuple(UPPER)), WITHOUT_ENCODERS, max_posture_error=1.5)
+    rig = Rig(make_policy(nominal_q=tuple(ALIENGO.upper)), WITHOUT_ENCODERS, max_posture_error=1.5)
     rig.tick()
     rig.supervisor.request("stand_up")
     for _ in range(500):
-        assert (rig.tick().q <= COMMAND_UPPER).all()
+        assert (rig.tick().q <= ALIENGO.command_upper).all()
     assert rig.mode == "stance"
 
 
@@ -406,13 +407,13 @@ def test_targets_of_the_policy_beyond_the_range_become_torque(policy: Any) -> No
     rig.policy.action = np.full(12, 4.0, np.float32)
     wanted = rig.policy.metadata.action.targets(rig.policy.action)
     for _ in range(4):  # torque grows by 30 N m a tick
-        rig.tick(FORWARD, q=NOMINAL_Q)
-    np.testing.assert_allclose(rig.answer.q, np.minimum(wanted, COMMAND_UPPER), rtol=1e-12)
+        rig.tick(FORWARD, q=ALIENGO.nominal_q)
+    np.testing.assert_allclose(rig.answer.q, np.minimum(wanted, ALIENGO.command_upper), rtol=1e-12)
     np.testing.assert_allclose(rig.answer.target, wanted)
     rig.policy.action = np.full(12, 1e6, np.float32)
     rig.run(0.02, FORWARD)
-    np.testing.assert_array_less(rig.answer.q, COMMAND_UPPER + 1e-9)
-    np.testing.assert_array_less(rig.answer.tau, TORQUE_LIMIT + 1e-9)
+    np.testing.assert_array_less(rig.answer.q, ALIENGO.command_upper + 1e-9)
+    np.testing.assert_array_less(rig.answer.tau, ALIENGO.torque_limit + 1e-9)
 
 
 LIMITS = [

@@ -122,7 +122,7 @@ KEEP = 4
 def believing(which: int) -> VelocityNetwork:
     """A network without corrections whose only share is that of a leg, 0 to 3, or of inertia, 4."""
     torch.manual_seed(0)
-    network = VelocityNetwork()
+    network = VelocityNetwork(features.default_layout(ALIENGO))
     last = network.body[-1]
     with torch.no_grad():
         last.weight.zero_()

@@ -15,7 +15,8 @@ import typer
 from rich.progress import Progress, TextColumn
 
 from quadvel_actuator.parameters import ActuatorParameters
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_estimator.kalman import KalmanConfig
 from quadvel_eval.paper import gap
 from quadvel_policy.observation import VelocityCommandLimits
@@ -169,7 +170,7 @@ def train_ablation(
 def _actuator_file(path: Path) -> Path:
     """Check an actuator file given as an option."""
     try:
-        ActuatorParameters.load(ALIENGO, path)
+        ActuatorParameters.load(load_robot(DEFAULT_ROBOT), path)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
     return path
@@ -300,18 +301,22 @@ def limit(
     backward: Annotated[float | None, typer.Option(help="Fastest backward, m/s.", min=0.0)] = None,
     sideways: Annotated[float | None, typer.Option(help="Fastest to either side, m/s.", min=0.0)] = None,
     turn: Annotated[float | None, typer.Option(help="Fastest turn either way, rad/s.", min=0.0)] = None,
+    robot: Annotated[str, typer.Option(help="Robot of the policy: a name, or a robot.yaml.")] = DEFAULT_ROBOT,
 ) -> None:
     """Narrow the commands that a policy file accepts; limits that are not given stay. Write its card again afterwards.
 
     `quadvel paper --only sustained` shows the share of the drives' speed that each command needs.
     """
-    known = PolicyFile(ALIENGO, policy).metadata.limits
+    chosen = load_robot(robot)
+    known = PolicyFile(chosen, policy).metadata.limits
     low, high = list(known.low), list(known.high)
     for axis, back, ahead in ((0, backward, forward), (1, sideways, sideways), (2, turn, turn)):
         low[axis] = low[axis] if back is None else -back
         high[axis] = high[axis] if ahead is None else ahead
     limiting.limit_commands(
-        policy, VelocityCommandLimits((low[0], low[1], low[2]), (high[0], high[1], high[2]), known.curve)
+        chosen,
+        policy,
+        VelocityCommandLimits((low[0], low[1], low[2]), (high[0], high[1], high[2]), known.curve),
     )
     _written(policy)
 

@@ -17,8 +17,9 @@ import attrs
 import numpy as np
 import torch
 
+from quadvel_description.network_input import InputLayout
 from quadvel_description.quadruped import GRAVITY
-from quadvel_description.robot import ALIENGO, load_robot
+from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_estimator import features
 from quadvel_sim.terrain import Terrain
@@ -34,7 +35,6 @@ from .walks import Walks, walks_on_both_grounds
 
 MEMORY = 128
 HIDDEN = (64,)
-LAYOUT = features.default_layout(ALIENGO)
 INITIAL_INERTIA_LOGIT = 2.0  # before training; the legs correct the velocity within some ticks
 
 
@@ -47,9 +47,14 @@ class VelocityNetwork(Recurrent):
     are unused.
     """
 
-    def __init__(self) -> None:
-        """Create the network; at first it relies on inertia."""
+    def __init__(self, layout: InputLayout) -> None:
+        """Create the network; at first it relies on inertia.
+
+        Args:
+            layout: terms of its input.
+        """
         super().__init__(features.INPUT_SIZE, 6 + 5, MEMORY, HIDDEN)
+        self.layout = layout
         with torch.no_grad():
             self.body[-1].bias[-1] = INITIAL_INERTIA_LOGIT
         spin = torch.linalg.cross(*torch.broadcast_tensors(torch.eye(3)[:, None], torch.eye(3)))
@@ -83,16 +88,18 @@ class VelocityNetwork(Recurrent):
         correction, log_variance, logits = self.body(torch.nn.functional.silu(y)).split([3, 3, 5], dim=-1)
         share = logits.softmax(-1)
         legs, keep = (
-            (share[..., :4, None] * _quantity(x, "leg_velocity").unflatten(-1, (4, 3))).sum(-2),
+            (share[..., :4, None] * self._quantity(x, "leg_velocity").unflatten(-1, (4, 3))).sum(-2),
             share[..., 4:],
         )
         # v[k] = s_0 (v[k-1] + dt (a + g - w x v[k-1])) + sum_i s_i v_leg_i + correction
         # with shares s = softmax(logits) of inertia and of the four legs, specific force a, gravity
         # g and
         # angular velocity w in the body frame
-        gained = TICK_S * (_quantity(x, "linear_acceleration") + GRAVITY * _quantity(x, "gravity"))
+        gained = TICK_S * (self._quantity(x, "linear_acceleration") + GRAVITY * self._quantity(x, "gravity"))
         # for rows: v - dt w x v = v (1 - dt [w]x)
-        turn = torch.eye(3) - TICK_S * (_quantity(x, "angular_velocity") @ self.spin).unflatten(-1, (3, 3))
+        turn = torch.eye(3) - TICK_S * (self._quantity(x, "angular_velocity") @ self.spin).unflatten(
+            -1, (3, 3)
+        )
         carried, added = keep[..., None] * turn, keep * gained + legs + correction
         velocity, track = h[1][0], []
         for k in range(x.shape[0]):
@@ -101,15 +108,14 @@ class VelocityNetwork(Recurrent):
         output = torch.cat([torch.stack(track), log_variance], dim=-1)
         return output, (torch.cat([hidden, velocity[None]], dim=-1), torch.cat([memory, c[1]], dim=-1))
 
-
-def _quantity(x: torch.Tensor, name: str) -> torch.Tensor:
-    """Extract a quantity from the network input (..., 69), in its unit, up to clipping."""
-    start = 0
-    for term in LAYOUT.terms:
-        if term.name == name:
-            return x[..., start : start + term.size] / term.scale
-        start += term.size
-    raise KeyError(name)
+    def _quantity(self, x: torch.Tensor, name: str) -> torch.Tensor:
+        """Extract a quantity from the network input (..., 69), in its unit, up to clipping."""
+        start = 0
+        for term in self.layout.terms:
+            if term.name == name:
+                return x[..., start : start + term.size] / term.scale
+            start += term.size
+        raise KeyError(name)
 
 
 Sequence = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
@@ -152,7 +158,7 @@ class EstimatedWalks:
         with torch.no_grad():
             for _ in range(length):
                 sensed = walks.sense()
-                x = features.build(ALIENGO, sensed, walks.previous_action, LAYOUT)
+                x = features.build(walks.env.robot, sensed, walks.previous_action, self.network.layout)
                 rows.append((x, walks.truth.copy(), ~walks.over))
                 # the controller has the estimate of the state before
                 believed = np.where(self.on_estimate[:, None], self._estimate, walks.noisy_truth())
@@ -262,13 +268,14 @@ class EstimatorRun:
         process_group.join("cpu")
         self.config = config = attrs.evolve(config, n=process_group.local_share(config.n))
         torch.manual_seed(config.seed)
-        self.network = VelocityNetwork()
+        self.robot = load_robot(config.robot)
+        self.network = VelocityNetwork(features.default_layout(self.robot))
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
         self.samples = 0
         self.walks = [
             EstimatedWalks(walks, self.network)
             for walks in walks_on_both_grounds(
-                load_robot(config.robot),
+                self.robot,
                 config.n,
                 process_group.process_seed(config.seed),
                 config.commands,
@@ -307,7 +314,7 @@ class EstimatorRun:
             path: ONNX file.
             recipe: how it was trained, for the metadata.
         """
-        metadata = features.metadata(ALIENGO, (1, 1, MEMORY + 3), recipe, commit(), LAYOUT)
+        metadata = features.metadata(self.robot, (1, 1, MEMORY + 3), recipe, commit(), self.network.layout)
         export(self.network, features.INPUT_SIZE, path, list(features.OUTPUTS), json.dumps(metadata))
 
     def step(self, done: float) -> dict[str, float]:

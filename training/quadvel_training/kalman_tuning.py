@@ -8,7 +8,7 @@ import attrs
 import numpy as np
 from scipy.optimize import minimize
 
-from quadvel_description.robot import ALIENGO, load_robot
+from quadvel_description.robot import Robot, load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.state import RobotState
 from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator
@@ -55,11 +55,13 @@ class WalkRecording:
     """Windows of T ticks of R robots, the first half of them on flat ground.
 
     Attributes:
+        robot: the robot.
         states: T readings, each of arrays (R, ...).
         truth: (T, R, 3), m/s, true velocity in the body frame.
         is_scored: (T, R) bool, ticks that count: the robot is up and the filter has settled.
     """
 
+    robot: Robot
     states: list[RobotState]
     truth: np.ndarray
     is_scored: np.ndarray
@@ -75,11 +77,11 @@ def record(config: TuningConfig, actor: Recurrent) -> WalkRecording:
     Returns:
         The recording.
     """
-    ticks = round(config.window / TICK_S)
+    robot, ticks = load_robot(config.robot), round(config.window / TICK_S)
     grounds = [
         [_window(walks, ticks) for _ in range(config.windows)]
         for walks in walks_on_both_grounds(
-            load_robot(config.robot),
+            robot,
             config.n,
             config.seed,
             config.commands,
@@ -99,7 +101,7 @@ def record(config: TuningConfig, actor: Recurrent) -> WalkRecording:
         for k in range(ticks)
     ]
     truth = np.concatenate([part.truth for part in parts], axis=1)
-    return WalkRecording(states, truth, np.concatenate([part.is_scored for part in parts], axis=1))
+    return WalkRecording(robot, states, truth, np.concatenate([part.is_scored for part in parts], axis=1))
 
 
 def _window(walks: Walks, ticks: int) -> WalkRecording:
@@ -113,7 +115,7 @@ def _window(walks: Walks, ticks: int) -> WalkRecording:
     walks.start_over(np.flatnonzero(walks.over))
     judged = np.array(alive)
     judged[: round(SETTLE_S / TICK_S)] = False
-    return WalkRecording(states, np.array(truth), judged)
+    return WalkRecording(walks.env.robot, states, np.array(truth), judged)
 
 
 def rmse(config: KalmanConfig, recording: WalkRecording) -> np.ndarray:
@@ -127,7 +129,7 @@ def rmse(config: KalmanConfig, recording: WalkRecording) -> np.ndarray:
         (2, 3), m/s per axis, on flat and on rough ground.
     """
     robots = recording.truth.shape[1]
-    estimator = KalmanEstimator(ALIENGO, config, (robots,))
+    estimator = KalmanEstimator(recording.robot, config, (robots,))
     square, count = np.zeros((robots, 3)), np.zeros((robots, 1))
     for state, truth, judged in zip(recording.states, recording.truth, recording.is_scored, strict=True):
         velocity, _ = estimator.update(state)

@@ -9,16 +9,17 @@ import attrs
 from quadvel_description.network_file import read_network
 from quadvel_description.onnx_format import message, serialise
 from quadvel_description.recurrent_network import METADATA_KEY
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot
 from quadvel_policy.observation import COMMAND_AXES, VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_recordings.output import atomic_write
 
 
-def limit_commands(policy: Path, limits: VelocityCommandLimits) -> None:
+def limit_commands(robot: Robot, policy: Path, limits: VelocityCommandLimits) -> None:
     """Rewrite the command limits in a policy file's metadata; everything else stays.
 
     Args:
+        robot: robot of the policy.
         policy: ONNX file, replaced atomically.
         limits: new lowest and highest vx, vy (m/s) and wz (rad/s), and limit in curves (m/s^2).
 
@@ -26,7 +27,7 @@ def limit_commands(policy: Path, limits: VelocityCommandLimits) -> None:
         ValueError: the limits are wider than those in the file, which the policy was trained for.
         NetworkFileError: the file is no policy file.
     """
-    metadata = PolicyFile(ALIENGO, policy).metadata
+    metadata = PolicyFile(robot, policy).metadata
     bounds = dict(zip(COMMAND_AXES, zip(limits.low, limits.high, strict=True), strict=True))
     for axis, (low, high) in bounds.items():
         least, most = metadata.command_limits[axis]

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from quadvel_description.command_range import clip_to_command_range
-from quadvel_description.robot import ALIENGO, Robot
+from quadvel_description.robot import Robot
 from quadvel_description.state import RobotState
 from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.observation import build_observation, default_observation
@@ -282,7 +282,7 @@ class Walks:
         command = env.command.copy()
         command[modes.mode == Mode.STOP] = [0.0, 0.0, 0.0, 1.0]
         obs = build_observation(
-            default_observation(ALIENGO),
+            default_observation(env.robot),
             command=command,
             quaternion=state.quaternion,
             q=state.q,
