@@ -14,6 +14,7 @@ from quadvel_sysid.model.applied_effect import AppliedEffect
 from quadvel_sysid.model.jacobian import DELAY_STEP_S, Unknowns, jacobian, pack, with_slots
 from quadvel_sysid.model.torque_model import Model
 from quadvel_sysid.search.effect_candidates.registry import candidate_classes
+from tests.helpers.robots import ALIENGO
 
 JOINTS = NAMES[:3]
 TRUTH = {
@@ -257,7 +258,7 @@ def test_effects_survive_the_file(tmp_path):
     effects = [Effect(name, JOINTS, value) for name, value in TRUTH.items()]
     truth = attrs.evolve(parameters(effects), joints=NAMES[:4])
     truth.save(tmp_path / "actuator.yaml")
-    loaded = ActuatorParameters.load(tmp_path / "actuator.yaml")
+    loaded = ActuatorParameters.load(ALIENGO, tmp_path / "actuator.yaml")
     assert [effect.parameters for effect in loaded.effects] == list(TRUTH.values())
     ActuatorModel(loaded, (4,))
 

@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from quadvel_actuator import ActuatorParameters, DelayPair, Effect
-from tests.helpers.robots import ALIENGO
+from tests.helpers.robots import ALIENGO, GO2
 
 
 def _written(tmp_path, **changes):
@@ -48,7 +48,7 @@ def test_saved_parameters_load_unchanged_with_their_effects(tmp_path):
         ActuatorParameters.of(ALIENGO), delta_kp=[-0.1 * i for i in range(12)], effects=[effect]
     )
     saved.save(tmp_path / "saved.yaml")
-    assert ActuatorParameters.load(tmp_path / "saved.yaml") == saved
+    assert ActuatorParameters.load(ALIENGO, tmp_path / "saved.yaml") == saved
     assert "# Variance of the torque noise (N^2 m^2)." in (tmp_path / "saved.yaml").read_text()
 
 
@@ -56,6 +56,7 @@ def test_saved_parameters_load_unchanged_with_their_effects(tmp_path):
     ("changes", "sentence"),
     [
         ({"schema": 2}, "ActuatorParameters.schema: found 2, expected one of 1"),
+        ({"robot": "go2"}, "ActuatorParameters.robot: found 'go2', expected 'aliengo'"),
         ({"kp_ref": -1}, "ActuatorParameters.kp_ref: found -1.0, expected above 0"),
         (
             {"delta_kp": [0.1] * 11},
@@ -87,7 +88,7 @@ def test_saved_parameters_load_unchanged_with_their_effects(tmp_path):
 def test_a_wrong_file_is_refused_with_file_field_value_and_expectation(tmp_path, changes, sentence):
     path = _written(tmp_path, **changes)
     with pytest.raises(ValueError, match=f"^{path}: {sentence}"):
-        ActuatorParameters.load(path)
+        ActuatorParameters.load(ALIENGO, path)
 
 
 @pytest.mark.parametrize("text", ["a: [1, 2", "- 1\n- 2\n", ""])
@@ -95,4 +96,10 @@ def test_a_file_that_is_no_parameter_mapping_is_refused(tmp_path, text):
     path = tmp_path / "odd.yaml"
     path.write_text(text)
     with pytest.raises(ValueError, match=f"^{path}: .+"):
-        ActuatorParameters.load(path)
+        ActuatorParameters.load(ALIENGO, path)
+
+
+def test_a_file_without_a_name_is_that_of_the_aliengo(tmp_path):
+    assert ActuatorParameters.load(ALIENGO, _written(tmp_path, robot=None)).robot == "aliengo"
+    with pytest.raises(ValueError, match=r"changed\.yaml: .*robot: found 'aliengo', expected 'go2'"):
+        ActuatorParameters.load(GO2, _written(tmp_path, robot=None))

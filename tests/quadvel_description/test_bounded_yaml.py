@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from quadvel_description.bounded_yaml import MAX_CHARACTERS, MAX_DEPTH, load_yam
 from quadvel_driver.calibration import Calibration
 from quadvel_lab.plant import read_plant
 from quadvel_sim.world import World
+from tests.helpers.robots import ALIENGO
 
 HOSTILE = {
     "lists in lists": ("[" * 100_000, "levels"),
@@ -30,7 +32,7 @@ HOSTILE = {
     "tag of Python": ("!!python/object/apply:os.system [x]", "tag"),
 }
 READERS: dict[str, Callable[[Path], object]] = {
-    "actuator": ActuatorParameters.load,
+    "actuator": partial(ActuatorParameters.load, ALIENGO),
     "calibration": Calibration.load,
     "parameters": read_parameter_file,
     "plant": read_plant,

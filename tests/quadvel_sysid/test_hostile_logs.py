@@ -17,6 +17,7 @@ import pytest
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
+from tests.helpers.robots import ALIENGO
 
 MAGIC = b"\x89MCAP0\r\n"
 SECOND = np.arange(0.0, 1.0, 0.01)
@@ -144,7 +145,7 @@ def test_malicious_metadata_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(LogError, match=f"{tmp_path}: not a complete recording"):
         read_log(tmp_path)
     with pytest.raises(ValueError, match=r"metadata\.yaml: "):
-        ActuatorParameters.load(tmp_path / "metadata.yaml")
+        ActuatorParameters.load(ALIENGO, tmp_path / "metadata.yaml")
     assert not sprung.exists()
 
 

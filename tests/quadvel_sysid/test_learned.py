@@ -8,6 +8,7 @@ from simulated_joints import parameters, record
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_sysid.identify import identify
+from tests.helpers.robots import ALIENGO
 
 VARIANCE = 0.066  # of the torque noise of these logs
 
@@ -58,7 +59,7 @@ def test_the_corrected_model_run_step_by_step_gives_what_the_report_claims(tmp_p
     assert [one["name"] for one in report["effects"]] == ["learned_residual"]
     assert report["effects"][0]["inputs"] == report["unexplained"]["depends_on"] == ["q", "dq"]
     found.parameters.save(tmp_path / "actuator.yaml")
-    loaded = ActuatorParameters.load(tmp_path / "actuator.yaml")
+    loaded = ActuatorParameters.load(ALIENGO, tmp_path / "actuator.yaml")
     model = ActuatorModel(attrs.evolve(loaded, torque_noise=0.0), (len(kept.joints),))
     rows = zip(kept.q, kept.dq, kept.q_des, strict=True)
     torque = np.array([model.step(q, dq, q_des, 30.0, 0.5) for q, dq, q_des in rows])

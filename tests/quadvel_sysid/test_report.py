@@ -173,7 +173,7 @@ def test_three_files_are_written_and_nothing_else(folder: Path) -> None:
 
 def test_the_json_is_the_report_and_the_yaml_the_model(folder: Path) -> None:
     assert json.loads((folder / "report.json").read_text()) == REPORT
-    assert ActuatorParameters.load(folder / "actuator.yaml") == ActuatorParameters.of(ALIENGO)
+    assert ActuatorParameters.load(ALIENGO, folder / "actuator.yaml") == ActuatorParameters.of(ALIENGO)
 
 
 def test_the_page_is_well_formed_and_loads_nothing(page: Page) -> None:

@@ -46,7 +46,7 @@ def test_a_run_keeps_what_it_is_and_how_it_fared(tmp_path, monkeypatch, drives):
     kept = sorted(path.name for path in (folder / "kept").iterdir())
     assert kept == [f"000000k.{suffix}" for suffix in ("json", "onnx", "pt")]
     assert json.loads((folder / "kept" / kept[0]).read_text()) == figures
-    assert [one.plant["actuator"] for one in setups] == [ActuatorParameters.load(drives)]
+    assert [one.plant["actuator"] for one in setups] == [ActuatorParameters.load(ALIENGO, drives)]
     assert (
         PolicyFile(ALIENGO, folder / "kept" / kept[1]).metadata.actuator["effects"][0]["name"]
         == "coulomb_friction"

@@ -170,7 +170,7 @@ def train_ablation(
 def _actuator_file(path: Path) -> Path:
     """Check an actuator file given as an option."""
     try:
-        ActuatorParameters.load(path)
+        ActuatorParameters.load(load_robot(DEFAULT_ROBOT), path)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
     return path

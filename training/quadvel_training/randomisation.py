@@ -259,7 +259,7 @@ def load_actuator(robot: Robot, name: str) -> ActuatorParameters:
     Returns:
         Their parameters.
     """
-    return ACTUATORS[name](robot) if name in ACTUATORS else ActuatorParameters.load(name)
+    return ACTUATORS[name](robot) if name in ACTUATORS else ActuatorParameters.load(robot, name)
 
 
 def sample_actuators(

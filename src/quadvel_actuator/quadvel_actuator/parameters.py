@@ -18,6 +18,7 @@ from quadvel_description.bounded_yaml import read_yaml
 from quadvel_description.fields import Numbers, field, positive, refusal
 from quadvel_description.records import structure_record
 from quadvel_description.robot import Robot
+from quadvel_description.robot_name import UNNAMED_ROBOT
 
 SCHEMA = 1
 DEFAULT_JOINT_COUNT = 12
@@ -90,6 +91,7 @@ class ActuatorParameters:
     Attributes:
         schema: version of the file format, `SCHEMA`.
         name: name of the actuators, for people.
+        robot: name of the robot; UNNAMED_ROBOT if a file has none.
         kp_ref: N m/rad, proportional gain at which the deviations were identified.
         kd_ref: N m s/rad, derivative gain at which the deviations were identified.
         delta_kp: N m/rad, deviation of the proportional gain at `kp_ref`: one number, three (hip,
@@ -104,6 +106,7 @@ class ActuatorParameters:
 
     schema: int = field(one_of=(SCHEMA,), whole=True)
     name: str
+    robot: str = field(UNNAMED_ROBOT)
     kp_ref: float = positive()
     kd_ref: float = positive()
     delta_kp: Numbers = field(at_least=-np.inf)
@@ -137,21 +140,25 @@ class ActuatorParameters:
         )
 
     @classmethod
-    def load(cls, path: str | Path) -> ActuatorParameters:
+    def load(cls, robot: Robot, path: str | Path) -> ActuatorParameters:
         """Read a parameter file.
 
         Args:
+            robot: The robot that the file has to belong to.
             path: YAML file.
 
         Returns:
             The parameters.
 
         Raises:
-            ValueError: the file is no valid parameter file; the message names the file, the field,
-                the value found and the expected one.
+            ValueError: the file is no valid parameter file, or that of another robot; the message
+                names the file, the field, the value found and the expected one.
         """
         content = read_yaml(Path(path), "a YAML file of actuator parameters")
-        return structure_record(cls, content, Path(path))
+        parameters = structure_record(cls, content, Path(path))
+        if parameters.robot != robot.name:
+            raise ValueError(f"{path}: {refusal(cls, 'robot', parameters.robot, repr(robot.name))}")
+        return parameters
 
     def save(self, path: str | Path) -> None:
         """Write the parameters as YAML with units in comments; `load` is the inverse.
@@ -178,7 +185,7 @@ class ActuatorParameters:
         Returns:
             The parameters in the robot's folder.
         """
-        return cls.load(robot.actuator_file)
+        return cls.load(robot, robot.actuator_file)
 
     @classmethod
     def ideal(cls, robot: Robot) -> ActuatorParameters:

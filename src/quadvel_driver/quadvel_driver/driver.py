@@ -94,7 +94,9 @@ class Driver(Node):
     def _create_publishers(self) -> None:
         self._low_state = self.create_publisher(LowState, "low_state", 10)
         self._motors = self.create_publisher(MotorStatus, "motor_status", 1)
-        self._view = RobotView(self, ORIENTATION_STD_RAD, ANGULAR_VELOCITY_STD, LINEAR_ACCELERATION_STD)
+        self._view = RobotView(
+            self, self._robot, ORIENTATION_STD_RAD, ANGULAR_VELOCITY_STD, LINEAR_ACCELERATION_STD
+        )
         self._teleop = self.create_publisher(Twist, "cmd_vel_teleop", 10)
         self._lock = self.create_publisher(Bool, "command_lock", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)

@@ -74,7 +74,7 @@ def eval_command(
     PolicyFile(ALIENGO, policy)  # fail on a bad file here, once, before any run
     LearnedEstimator(ALIENGO, estimator_file)
     if actuator is not None:
-        ActuatorParameters.load(actuator)
+        ActuatorParameters.load(ALIENGO, actuator)
     folder = output_folder(out)
     with walk_progress_bar() as bar:
         task = bar.add_task("walks", total=None)

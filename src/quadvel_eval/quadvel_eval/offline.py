@@ -238,7 +238,7 @@ def replay_command(
       quadvel replay walk.mcap --actuator out/identify/actuator.yaml
     To see a recording in 3-D: quadvel view walk.mcap
     """
-    model = ActuatorParameters.of(ALIENGO) if actuator is None else ActuatorParameters.load(actuator)
+    model = ActuatorParameters.of(ALIENGO) if actuator is None else ActuatorParameters.load(ALIENGO, actuator)
     asked = LearnedEstimator(ALIENGO, estimator_file) if estimator == "learned" else KalmanEstimator(ALIENGO)
     output_folder(out)
     run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording))

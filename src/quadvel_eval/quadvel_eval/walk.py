@@ -83,7 +83,7 @@ def make_simulator(setup: Setup, seed: int) -> Simulator:
     rng = np.random.default_rng(seed)
     drawn = _draw_plant(rng) if setup.randomised else {}
     if setup.actuator is not None:
-        drawn["actuator"] = ActuatorParameters.load(setup.actuator)
+        drawn["actuator"] = ActuatorParameters.load(ALIENGO, setup.actuator)
     simulator = Simulator(
         SimulatorConfig(**{"robot": ALIENGO, "terrain": terrain, "seed": seed, **drawn, **setup.plant})
     )

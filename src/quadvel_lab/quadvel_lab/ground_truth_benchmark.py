@@ -220,7 +220,7 @@ def evaluate_models(folders: Mapping[str, Path], console: Console) -> list[dict[
     commands = [(np.array(step.velocity), step.duration) for step in drives]
     calls: list[Call] = [(replay.predicted_tracking, own, commands, seed) for seed in MODEL_SEEDS]
     for folder in folders.values():
-        corrected = ActuatorParameters.load(folder / "identify" / "actuator.yaml")
+        corrected = ActuatorParameters.load(ALIENGO, folder / "identify" / "actuator.yaml")
         calls += [(replay.predicted_tracking, corrected, commands, seed) for seed in MODEL_SEEDS]
         calls += [(_replay_errors, model, folder / f"{WALKS[1]}.mcap") for model in (own, corrected)]
     answers = iter(_answers(calls, console))

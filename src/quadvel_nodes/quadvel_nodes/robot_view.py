@@ -20,7 +20,7 @@ from tf2_msgs.msg import TFMessage
 from quadvel_description.arrays import Array
 from quadvel_description.frames import IMU, FramePose, fixed_links, moving_links
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot
 from quadvel_description.state import RobotState
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -30,16 +30,23 @@ class RobotView:
     """Publishes imu, joint_states, /tf, and once /tf_static and robot_description, on behalf of a node."""
 
     def __init__(
-        self, node: Node, orientation: float, angular_velocity: float, linear_acceleration: float
+        self,
+        node: Node,
+        robot: Robot,
+        orientation: float,
+        angular_velocity: float,
+        linear_acceleration: float,
     ) -> None:
         """Create the publishers and publish the latched topics.
 
         Args:
             node: The node that owns the publishers.
+            robot: The robot.
             orientation: Standard deviation of the IMU's orientation about each axis, rad.
             angular_velocity: Standard deviation of the angular velocity, rad/s.
             linear_acceleration: Standard deviation of the acceleration, m/s^2.
         """
+        self._robot = robot
         self._joint_states = node.create_publisher(JointState, "joint_states", 10)
         self._tf = node.create_publisher(TFMessage, "/tf", 100)
         self._imu = node.create_publisher(Imu, "imu", 10)
@@ -52,8 +59,8 @@ class RobotView:
             node.create_publisher(String, "robot_description", LATCHED),
         ]
         stamp = node.get_clock().now().to_msg()
-        self._latched[0].publish(TFMessage(transforms=transform_messages(stamp, fixed_links(ALIENGO))))
-        self._latched[1].publish(String(data=ALIENGO.urdf_file.read_text(encoding="utf-8")))
+        self._latched[0].publish(TFMessage(transforms=transform_messages(stamp, fixed_links(robot))))
+        self._latched[1].publish(String(data=robot.urdf_file.read_text(encoding="utf-8")))
 
     def publish(self, stamp: Any, state: RobotState) -> None:
         """Publish one state on the topics to which somebody subscribes.
@@ -69,7 +76,9 @@ class RobotView:
             joints.effort = state.tau.tolist()
             self._joint_states.publish(joints)
         if self._tf.get_subscription_count():
-            self._tf.publish(TFMessage(transforms=transform_messages(stamp, moving_links(ALIENGO, state.q))))
+            self._tf.publish(
+                TFMessage(transforms=transform_messages(stamp, moving_links(self._robot, state.q)))
+            )
         if self._imu.get_subscription_count():
             imu = self._noise
             imu.header.stamp = stamp

@@ -137,7 +137,7 @@ class PlantParameters(Scheduling):
         if not self.actuator_file:
             return ActuatorParameters.of(robot)
         try:
-            return ActuatorParameters.load(self.actuator_file)
+            return ActuatorParameters.load(robot, self.actuator_file)
         except OSError as error:
             raise ValueError(f"actuator_file: cannot read {self.actuator_file}: {error.strerror}") from error
 

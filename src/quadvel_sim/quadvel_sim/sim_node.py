@@ -39,8 +39,11 @@ class SimNode(SimulationNode[SimParameters]):
         self._low_state = self.create_publisher(LowState, "low_state", 10)
         self._waiting = self.create_publisher(Waiting, "waiting", 1)
         self._clock_publisher = self.create_publisher(ClockMessage, "/clock", 10)
-        noise = self._loop.simulator.config.noise
-        self._view = RobotView(self, noise.orientation, noise.angular_velocity, noise.linear_acceleration)
+        config = self._loop.simulator.config
+        noise = config.noise
+        self._view = RobotView(
+            self, config.robot, noise.orientation, noise.angular_velocity, noise.linear_acceleration
+        )
         self.create_subscription(LowCmd, "low_cmd", self._on_command, 10, raw=True)
         self.start()
 

@@ -176,7 +176,9 @@ def identify(
         return_freed_arrays_to_system()
         names = ColumnMap() if columns is None else ColumnMap.load(columns)
         read = partial(read_log, joints=joints, names=names, topics=Topics(state_topic, command_topic))
-        parameters = ActuatorParameters.of(ALIENGO) if base is None else ActuatorParameters.load(base)
+        parameters = (
+            ActuatorParameters.of(ALIENGO) if base is None else ActuatorParameters.load(ALIENGO, base)
+        )
         options = IdentifyOptions(gains=gains, base=parameters, robot=robot)
         found = _identify(logs, holdout or [], read, options, cores, messages)
         _write(found, out, force, messages)

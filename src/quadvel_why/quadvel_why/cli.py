@@ -8,7 +8,6 @@ from typing import Annotated
 
 import typer
 
-from quadvel_description.robot import ALIENGO
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_recordings.output import atomic_write, output_folder
 
@@ -35,6 +34,14 @@ def why_command(
             metavar="<file>",
             help="ONNX file of the policy that drove.",
             show_default="the shipped one, for a recording of this stack",
+        ),
+    ] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            metavar="<name|file>",
+            help="The robot: aliengo, go2 or a robot.yaml.",
+            show_default="as recorded, or aliengo",
         ),
     ] = None,
     gains: Annotated[
@@ -69,10 +76,8 @@ def why_command(
       2  a wrong argument or file
     """
     output_folder(out)
-    driver = PolicyFile(ALIENGO, policy) if policy is not None else None
-    run = read_run(recording, gains)
-    if driver is None and run.is_own:
-        driver = PolicyFile(ALIENGO)
+    run = read_run(recording, gains, robot)
+    driver = PolicyFile(run.robot, policy) if policy is not None or run.is_own else None
     for remark in run.remarks:
         typer.echo(f"quadvel: warning: {recording}: {remark}", err=True)
     diagnosis = diagnose(Signals(run, driver))

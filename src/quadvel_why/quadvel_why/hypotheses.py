@@ -15,7 +15,6 @@ import numpy as np
 from quadvel_description.arrays import Array, Indices
 from quadvel_description.kinematics import foot_kinematics
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import ALIENGO
 
 from .explanation import REORDERINGS
 from .legs import Legs
@@ -188,7 +187,7 @@ def best_offset(legs: Legs) -> OffsetFit | None:
 
 def _height_equations(legs: Legs) -> tuple[Array, Array, Array, Array]:
     """Heights (k,), horizontal distances (k, 2), effects of the joints (k, 12) and times (k,) of all pairs."""
-    _, jacobians = foot_kinematics(ALIENGO, legs.run.q)
+    _, jacobians = foot_kinematics(legs.run.robot, legs.run.q)
     up: Array = legs.rotation[:, 2, :]  # z of a body vector in the world: R[2] . v
     effect = np.einsum("na,nlaj->nlj", up, jacobians)  # (n, 4, 3)
     world = np.asarray(legs.feet @ legs.rotation.swapaxes(-1, -2))

@@ -17,7 +17,6 @@ import numpy as np
 
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.kinematics import foot_kinematics, rotation_matrix
-from quadvel_description.robot import ALIENGO
 from quadvel_description.state import RobotState
 from quadvel_estimator.odometry import leg_velocity
 
@@ -71,7 +70,7 @@ class Legs:
         self.run = run
         self._q, self._dq, self._tau = joints or (run.q, run.dq, run.tau)
         self.rotation = rotation_matrix(run.imu.quaternion)
-        self.feet, self._jacobians = foot_kinematics(ALIENGO, self._q)
+        self.feet, self._jacobians = foot_kinematics(run.robot, self._q)
         finite = np.isfinite(self._q).all(axis=1) & np.isfinite(run.imu.quaternion).all(axis=1)
         self.usable = (run.walking if walking_only else run.on_feet) & finite
 
@@ -108,7 +107,7 @@ class Legs:
             run.imu.linear_acceleration,
             np.zeros(4),
         )
-        return self._to_world(leg_velocity(ALIENGO, state, self.rotation))
+        return self._to_world(leg_velocity(run.robot, state, self.rotation))
 
     @cached_property
     def height(self) -> Array:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from quadvel_description.arrays import Array, Bools, Indices
 from quadvel_description.network_input import InputLayout
-from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_policy.command_limits import JointCommandLimits
 from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.observation import JOINTS, build_observation
@@ -213,9 +212,9 @@ class PolicyReplay:
         power = np.maximum(now * run.dq[rows], 0.0).sum(axis=1, keepdims=True)
         return np.asarray(
             (np.abs(commands.tau[ticks]) > MAX_FEED_FORWARD_NM)
-            | (np.abs(now) > NEAR_LIMIT * TORQUE_LIMIT)
+            | (np.abs(now) > NEAR_LIMIT * run.robot.torque_limit)
             | (np.abs(now - before) > NEAR_LIMIT * limits.max_torque_step)
-            | (np.abs(run.dq[rows]) > NEAR_LIMIT * VELOCITY_LIMIT)
+            | (np.abs(run.dq[rows]) > NEAR_LIMIT * run.robot.velocity_limit)
             | (power > NEAR_LIMIT * limits.max_power)
         )
 

@@ -11,10 +11,12 @@ import numpy as np
 
 from quadvel_description.arrays import Array, Floats, Indices
 from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import Robot, robot_of_file
+from quadvel_description.robot_name import described_robot
 from quadvel_description.state import MODE_DAMPING
 from quadvel_eval.recording import Series, planar
 from quadvel_nodes.messages import seconds
-from quadvel_recordings.reading import RecordingError, read_messages, topics
+from quadvel_recordings.reading import RecordingError, read_messages, recorded_description, topics
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.logs.read_log import read_log
 
@@ -36,12 +38,13 @@ Messages = Mapping[str, Sequence[Any]]
 """Messages by name of their topic's role."""
 
 
-def read_run(path: Path, gains: tuple[float, float] | None = None) -> Run:
+def read_run(path: Path, gains: tuple[float, float] | None = None, robot: str | None = None) -> Run:
     """Read a recording.
 
     Args:
         path: A recording (MCAP, rosbag2, ROS 1), or a table that `quadvel identify` reads.
         gains: kp (N m/rad) and kd (N m s/rad) of the commands, if the file holds none.
+        robot: Name or file of the robot; None for the one that the recording names.
 
     Returns:
         The run.
@@ -49,18 +52,21 @@ def read_run(path: Path, gains: tuple[float, float] | None = None) -> Run:
     Raises:
         RecordingError: The file holds too little for a diagnosis.
         LogError: A table cannot be used.
+        ValueError: The recording is that of another robot.
     """
     is_recording = path.suffix in RECORDINGS or path.is_dir()
     types = topics(path) if is_recording else {}
+    named = described_robot(recorded_description(path)) if is_recording else None
+    kind = robot_of_file(path, named, robot)
     if STATE in types.values():
-        return _own_run(path, types)
+        return _own_run(path, kind, types)
     log = read_log(path)
     if gains is None and (log.kp is None or log.kd is None):
         raise RecordingError(f"{path}: kp, kd: the commands hold no gains, expected --gains KP KD")
-    return _run_of_log(log.with_gains(gains), _others_imu(path, types, log))
+    return _run_of_log(kind, log.with_gains(gains), _others_imu(path, types, log))
 
 
-def _own_run(path: Path, types: Mapping[str, str]) -> Run:
+def _own_run(path: Path, robot: Robot, types: Mapping[str, str]) -> Run:
     """Run from the topics of this stack; they are found by their types."""
     roles = {STATE: "states", COMMAND: "commands"} | {kind: role for role, kind in OTHER_TYPES.items()}
     remarks: list[str] = []
@@ -78,6 +84,7 @@ def _own_run(path: Path, types: Mapping[str, str]) -> Run:
     states, start = [states[i] for i in order], float(stamps.min())
     return Run(
         name=str(path),
+        robot=robot,
         joints=JOINT_NAMES,
         time=stamps[order] - start,
         q=_rows(states, "q"),
@@ -165,7 +172,7 @@ def _others_imu(path: Path, types: Mapping[str, str], log: Log) -> Imu | None:
     return Imu(*(_rows(found, field) for field in ("quaternion", "gyroscope", "accelerometer")))
 
 
-def _run_of_log(log: Log, imu: Imu | None) -> Run:
+def _run_of_log(robot: Robot, log: Log, imu: Imu | None) -> Run:
     """Run of a joint log; the commands of a log hold position if their stiffness is above zero."""
     start = float(log.t[0])
     assert log.kp is not None
@@ -187,6 +194,7 @@ def _run_of_log(log: Log, imu: Imu | None) -> Run:
     )
     return Run(
         name=log.name,
+        robot=robot,
         joints=log.joints,
         time=floats(log.t) - start,
         q=floats(log.q),

@@ -8,6 +8,7 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Array, Bools, Indices
+from quadvel_description.robot import Robot
 from quadvel_eval.recording import Series
 
 SAME_INSTANT_S = 1e-6
@@ -80,6 +81,7 @@ class Run:
 
     Attributes:
         name: Path of the recording.
+        robot: The robot.
         joints: Names of the joints, (J,).
         time: Times of the states, (n,), s.
         q: Angles, (n, J), rad.
@@ -97,6 +99,7 @@ class Run:
     """
 
     name: str
+    robot: Robot
     joints: tuple[str, ...]
     time: Array
     q: Array

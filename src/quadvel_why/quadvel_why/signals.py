@@ -11,7 +11,7 @@ import numpy as np
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.arrays import Array, Bools
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot
 from quadvel_description.state import RobotState
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.learned import LearnedEstimator
@@ -54,10 +54,11 @@ class Trained:
     gains: tuple[float, float] = (0.9765, 0.958)
 
     @classmethod
-    def from_policy(cls, policy: PolicyFile) -> Trained:
+    def from_policy(cls, robot: Robot, policy: PolicyFile) -> Trained:
         """Read the ranges from the metadata of a policy.
 
         Args:
+            robot: The robot.
             policy: The policy.
 
         Returns:
@@ -65,7 +66,7 @@ class Trained:
         """
         recipe = policy.metadata.recipe if isinstance(policy.metadata.recipe, dict) else {}
         ranges = recipe.get("configuration", {}).get("randomisation", {})
-        drives = ActuatorParameters.of(ALIENGO)
+        drives = ActuatorParameters.of(robot)
         longest = max(p.input_delay_s + p.output_delay_s for p in drives.probable_pairs)
         kp, kd = np.mean(drives.delta_kp), np.mean(drives.delta_kd)
         return cls(
@@ -86,7 +87,7 @@ class Signals:
 
     def __init__(self, run: Run, policy: PolicyFile | None) -> None:
         self.run, self.policy = run, policy
-        self.trained = Trained() if policy is None else Trained.from_policy(policy)
+        self.trained = Trained() if policy is None else Trained.from_policy(run.robot, policy)
 
     @cached_property
     def parts(self) -> frozenset[str]:
@@ -184,7 +185,7 @@ class Signals:
         run, commands = self.run, self.run.commands
         assert run.imu is not None
         assert run.tau is not None
-        estimator = LearnedEstimator(ALIENGO)
+        estimator = LearnedEstimator(run.robot)
         found = np.full((len(run.time), 3), np.nan)
         # The action in force when a state is measured is the answer to an earlier state.
         newest = np.searchsorted(commands.answers, np.arange(len(run.time)), side="left") - 1
@@ -201,7 +202,7 @@ class Signals:
                 np.zeros(4),
             )
             mode = 10 if row >= 0 and commands.servo[row] else 0
-            action = previous_action(ALIENGO, commands.q[row], mode) if row >= 0 else np.zeros(12)
+            action = previous_action(run.robot, commands.q[row], mode) if row >= 0 else np.zeros(12)
             try:
                 found[k] = estimator.update(state, action)[0]
             except FloatingPointError:

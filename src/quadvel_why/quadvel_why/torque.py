@@ -17,7 +17,6 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Array, Bools, Indices
-from quadvel_description.robot import TORQUE_LIMIT
 
 from .run import Run
 
@@ -88,7 +87,7 @@ class ExactModel:
     def __init__(self, run: Run) -> None:
         assert run.tau is not None
         joints = len(run.joints)
-        limit = TORQUE_LIMIT if run.is_own else np.full(joints, np.inf)
+        limit = run.robot.torque_limit if run.is_own else np.full(joints, np.inf)
         found = []
         before: Indices | None = None
         for delay in np.arange(0.0, MAX_EXACT_DELAY_S, DELAY_STEP_S):

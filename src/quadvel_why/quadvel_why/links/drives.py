@@ -8,7 +8,6 @@ from typing_extensions import override
 
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.quadruped import KINDS
-from quadvel_description.robot import TORQUE_LIMIT
 
 from ..cause import NOTHING, Cause, Link, Measurement, Trace, worst_span
 from ..signals import Signals
@@ -188,7 +187,7 @@ class TorqueLimit(Cause):
         if short is None or short.falls_with_speed:
             return NOTHING
         run, j = signals.run, short.joint
-        rated = f", rated {TORQUE_LIMIT[j]:.1f} N m" if run.is_own else ""
+        rated = f", rated {run.robot.torque_limit[j]:.1f} N m" if run.is_own else ""
         sentence = (
             f"{run.joints[j]} gives {short.level:.1f} N m{rated} while more is asked for, in "
             f"{100 * short.share:.1f} % of the states"

@@ -7,7 +7,6 @@ from typing_extensions import override
 
 from quadvel_description.arrays import Array
 from quadvel_description.quadruped import GRAVITY
-from quadvel_description.robot import MASS
 
 from ..cause import Cause, Link, Measurement, Trace, worst_span
 from ..legs import Legs
@@ -130,10 +129,11 @@ class Payload(Cause):
         if rows.sum() * signals.run.period < MIN_WEIGHING_S:
             return None
         total = legs.force[..., 2].sum(axis=1)
-        mass = float(total[rows].mean()) / GRAVITY / FOUND_MASS_SHARE - MASS
+        own = signals.run.robot.mass
+        mass = float(total[rows].mean()) / GRAVITY / FOUND_MASS_SHARE - own
         low, high = signals.trained.payload
         beyond = max(mass - high, low - mass, 0.0)
-        expected = np.full(len(total), MASS * GRAVITY * FOUND_MASS_SHARE)
+        expected = np.full(len(total), own * GRAVITY * FOUND_MASS_SHARE)
         trace = Trace("force of all feet and of the robot's weight, N", signals.run.time, total, expected)
         sentence = (
             f"the feet carry {mass:+.1f} kg more than the robot, trained from {low:+.0f} to {high:+.0f} kg"
