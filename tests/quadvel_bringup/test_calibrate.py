@@ -18,12 +18,12 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 
 from quadvel_bringup.recorder import Recorder  # noqa: E402
 from quadvel_bringup.recording_file import RecordingFile  # noqa: E402
-from quadvel_description.robot import NOMINAL_Q  # noqa: E402
 from quadvel_description.state import JointCommand  # noqa: E402
 from quadvel_driver.calibration import Calibration  # noqa: E402
 from quadvel_msgs.msg import LowState  # noqa: E402
 from quadvel_nodes.messages import write_low_state  # noqa: E402
 from quadvel_sim.simulator import Simulator  # noqa: E402
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
 LEANING = Calibration(imu_mounting=np.radians([2.0, -1.0]))
@@ -38,7 +38,7 @@ def record_standing(path: Path, seconds: float) -> None:
     publisher = node.create_publisher(LowState, "low_state", 10)
     simulator = Simulator()
     simulator.reset("stand")
-    hold = JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+    hold = JointCommand(q=np.array(ALIENGO.nominal_q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
     with Recorder(node, RecordingFile(path)) as recorder:
         recorder.record("/low_state", "quadvel_msgs/msg/LowState")
         for _ in range(round(200 * seconds)):
