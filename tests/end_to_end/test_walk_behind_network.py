@@ -21,7 +21,7 @@ from quadvel_eval.robot_loop import RobotLoop
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.bad_network import BadNetwork, NetworkConfig
-from quadvel_sim.simulator import Simulator
+from quadvel_sim.simulator import Simulator, SimulatorConfig
 from tests.helpers.robots import ALIENGO
 
 BAD = NetworkConfig(network_loss=0.02, network_jitter=0.002)
@@ -55,7 +55,7 @@ class BehindNetwork:
 
     def __init__(self, network: NetworkConfig, packets: Any) -> None:
         self._packets = packets
-        self._simulator = Simulator()
+        self._simulator = Simulator(SimulatorConfig(robot=ALIENGO))
         self._simulator.reset("stand")
         self._there, self._back = BadNetwork(network, 0), BadNetwork(network, 1)
         self._wire = Wire()
@@ -137,7 +137,7 @@ def walked(simulator: Any, velocity: tuple[float, float, float]) -> np.ndarray:
 def test_with_2_percent_loss_and_2_ms_jitter_tracking_is_within_2_cm_per_s(
     packets: Any, velocity: tuple[float, float, float]
 ) -> None:
-    plain = Simulator()
+    plain = Simulator(SimulatorConfig(robot=ALIENGO))
     plain.reset("stand")
     behind = BehindNetwork(BAD, packets)
     without, through = walked(plain, velocity), walked(behind, velocity)

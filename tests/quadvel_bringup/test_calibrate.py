@@ -22,7 +22,7 @@ from quadvel_description.state import JointCommand  # noqa: E402
 from quadvel_driver.calibration import Calibration  # noqa: E402
 from quadvel_msgs.msg import LowState  # noqa: E402
 from quadvel_nodes.messages import write_low_state  # noqa: E402
-from quadvel_sim.simulator import Simulator  # noqa: E402
+from quadvel_sim.simulator import Simulator, SimulatorConfig  # noqa: E402
 from tests.helpers.robots import ALIENGO  # noqa: E402
 
 QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
@@ -36,7 +36,7 @@ def record_standing(path: Path, seconds: float) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     publisher = node.create_publisher(LowState, "low_state", 10)
-    simulator = Simulator()
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO))
     simulator.reset("stand")
     hold = JointCommand(q=np.array(ALIENGO.nominal_q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
     with Recorder(node, RecordingFile(path)) as recorder:

@@ -100,7 +100,7 @@ def test_a_robot_whose_sensors_are_right_is_found_to_be_so() -> None:
 
 
 def test_what_is_set_right_is_what_was(standing: Samples) -> None:
-    simulator = Simulator()
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO))
     simulator.reset("stand")
     state = simulator.state()
     back = OFF.apply(OFF.as_reported(state))

@@ -20,7 +20,7 @@ from quadvel_driver.link import NO_CALIBRATION, Link
 from quadvel_driver.udp import UdpConfig, UdpTransport
 from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.board import Board, BoardError
-from quadvel_sim.simulator import Simulator
+from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.udp_board import UdpBoard
 from tests.helpers.boards import running, wait_for
 from tests.helpers.robots import ALIENGO
@@ -35,7 +35,7 @@ def serve() -> Iterator[Callable[..., Board]]:
 
         def begin(off: Calibration = NO_CALIBRATION, **network: float) -> Board:
             board = UdpBoard(("127.0.0.1", 0), NetworkConfig(**network), off)
-            ends.enter_context(running(board, Simulator()))
+            ends.enter_context(running(board, Simulator(SimulatorConfig(robot=ALIENGO))))
             return board
 
         yield begin

@@ -141,7 +141,7 @@ def test_realtime_keeps_pace_with_the_clock() -> None:
     def note(state: RobotState, instant: float) -> None:
         samples.append((state.time, instant, time.monotonic() - instant))
 
-    loop = SimulationLoop(Simulator(), note)
+    loop = SimulationLoop(Simulator(SimulatorConfig(robot=ALIENGO)), note)
     with running(loop):
         wait_for(lambda: len(samples) > 60)
     simulated, instants, late = np.array(samples).T

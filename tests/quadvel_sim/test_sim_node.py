@@ -205,7 +205,10 @@ def test_a_diverged_simulation_ends_the_node_with_one_sentence(
     ("parameters", "sentence"),
     [
         ({"mode": "slow"}, "mode: found 'slow', expected one of realtime, lockstep, fast"),
-        ({"friktion": 0.5}, "unknown parameter friktion, expected one of realtime_priority, cpus, keyframe,"),
+        (
+            {"friktion": 0.5},
+            "unknown parameter friktion, expected one of realtime_priority, cpus, robot, keyframe,",
+        ),
         ({"keyframe": "sit"}, "keyframe: found 'sit', expected one of stand, lie"),
     ],
 )

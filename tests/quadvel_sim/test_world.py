@@ -286,7 +286,7 @@ def test_what_the_robot_touches_is_counted_by_name_and_pushes_back() -> None:
 
 
 def test_without_a_world_there_is_no_scan_and_nobody() -> None:
-    simulator = Simulator()
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO))
     with pytest.raises(ValueError, match="scan: found no world"):
         simulator.scan()
     assert simulator.persons().shape == (0, 3)

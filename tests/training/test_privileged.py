@@ -120,7 +120,7 @@ def test_the_mirrored_robot_observes_the_mirror_image():
     for ids, mirror in ((0, lambda x: x), (1, symmetry.JOINTS)):
         env._qpos[ids, 3:7] = [1.0, 0.0, 0.0, 0.0]
         env._qpos[ids, 2] = 0.4
-        env._qpos[ids, 7:] = mirror(joints) + privileged.ALIENGO.nominal_q
+        env._qpos[ids, 7:] = mirror(joints) + ALIENGO.nominal_q
         env._qvel[ids, 6:] = mirror(3 * joints)
         env._qvel[ids, :6] = [0.5, (0.1, -0.1)[ids], 0.0, (0.2, -0.2)[ids], 0.3, (0.4, -0.4)[ids]]
     env._update_state()

@@ -136,10 +136,12 @@ def test_commands_reverse_where_the_contrary_may_be_drawn(commands):
 
 def test_a_rated_drive_gives_full_torque_at_rest_and_none_at_its_top_speed():
     stall, no_load = (
-        np.concatenate([[effect.intervals[name]] * len(effect.joints) for effect in rated_drives().effects])
+        np.concatenate(
+            [[effect.intervals[name]] * len(effect.joints) for effect in rated_drives(ALIENGO).effects]
+        )
         for name in ("stall", "no_load")
     )
-    names = [joint for effect in rated_drives().effects for joint in effect.joints]
+    names = [joint for effect in rated_drives(ALIENGO).effects for joint in effect.joints]
     order = joint_index(names)
     assert sorted(order) == list(range(12))
     assert stall == pytest.approx(np.outer(ALIENGO.torque_limit[order], RATED_STALL))
