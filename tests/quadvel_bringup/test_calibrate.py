@@ -18,7 +18,6 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 
 from quadvel_bringup.recorder import Recorder  # noqa: E402
 from quadvel_bringup.recording_file import RecordingFile  # noqa: E402
-from quadvel_description.robot import NOMINAL_Q  # noqa: E402
 from quadvel_description.state import JointCommand  # noqa: E402
 from quadvel_driver.calibration import Calibration  # noqa: E402
 from quadvel_msgs.msg import LowState  # noqa: E402
@@ -39,7 +38,7 @@ def record_standing(path: Path, seconds: float) -> None:
     publisher = node.create_publisher(LowState, "low_state", 10)
     simulator = Simulator(SimulatorConfig(robot=ALIENGO))
     simulator.reset("stand")
-    hold = JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+    hold = JointCommand(q=np.array(ALIENGO.nominal_q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
     with Recorder(node, RecordingFile(path)) as recorder:
         recorder.record("/low_state", "quadvel_msgs/msg/LowState")
         for _ in range(round(200 * seconds)):

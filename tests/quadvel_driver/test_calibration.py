@@ -9,10 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadvel_description import robot
 from quadvel_description.kinematics import roll_pitch, rotate_inverse
 from quadvel_description.mjcf import Plant, load_model
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver.calibration import Calibration, CalibrationError
 from quadvel_driver.find_calibration import CalibrationDataError, Samples, fit_calibration, holding_torque
@@ -32,7 +30,11 @@ def recorded(hung: bool, seconds: float, off: Calibration) -> list[RobotState]:
     """What a simulated robot reports whose sensors are off, driven to where they say it should go."""
     simulator = Simulator(SimulatorConfig(robot=ALIENGO, suspended=hung, seed=3))
     simulator.reset("stand")
-    targets = Creep(seconds=seconds).targets() if hung else np.tile(NOMINAL_Q, (round(1e3 * seconds), 1))
+    targets = (
+        Creep(ALIENGO, seconds=seconds).targets()
+        if hung
+        else np.tile(ALIENGO.nominal_q, (round(1e3 * seconds), 1))
+    )
     states = []
     for step in range(0, len(targets), 5):
         wanted = JointCommand(q=targets[step], kp=np.full(12, 100.0), kd=np.full(12, 3.0))
@@ -58,16 +60,18 @@ def test_the_holding_torque_is_that_of_the_simulator() -> None:
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
     for _ in range(5):
-        q = robot.LOWER + rng.uniform(0.2, 0.8, 12) * (robot.UPPER - robot.LOWER)
+        q = ALIENGO.lower + rng.uniform(0.2, 0.8, 12) * (ALIENGO.upper - ALIENGO.lower)
         turn = rng.normal(size=4)
         data.qpos[3:7], data.qpos[7:], data.qvel[:] = turn / np.linalg.norm(turn), q, 0.0
         mujoco.mj_forward(model, data)
         down = rotate_inverse(data.qpos[3:7], np.array([0.0, 0.0, -1.0]))
-        np.testing.assert_allclose(holding_torque(q[None], down[None])[0], data.qfrc_bias[6:], atol=1e-9)
+        np.testing.assert_allclose(
+            holding_torque(ALIENGO, q[None], down[None])[0], data.qfrc_bias[6:], atol=1e-9
+        )
 
 
 def test_zeros_and_mounting_are_found_together(hung: Samples, standing: Samples) -> None:
-    found = fit_calibration(hung, standing)
+    found = fit_calibration(ALIENGO, hung, standing)
     np.testing.assert_allclose(found.calibration.joint_zeros, OFF.joint_zeros, atol=1.5 * DEGREE)
     np.testing.assert_allclose(found.calibration.imu_mounting, OFF.imu_mounting, atol=1.2 * DEGREE)
     assert found.unevenness < 0.005
@@ -78,7 +82,7 @@ def test_zeros_and_mounting_are_found_together(hung: Samples, standing: Samples)
 
 def test_an_imu_that_leans_by_two_degrees_is_found_from_standing_alone() -> None:
     leaning = Calibration(imu_mounting=DEGREE * np.array([2.0, 0.0]))
-    found = fit_calibration(None, Samples.from_states(recorded(False, 3.0, leaning)))
+    found = fit_calibration(ALIENGO, None, Samples.from_states(recorded(False, 3.0, leaning)))
     np.testing.assert_allclose(found.calibration.imu_mounting, leaning.imu_mounting, atol=0.1 * DEGREE)
     assert not found.calibration.joint_zeros.any()
 
@@ -87,7 +91,9 @@ def test_an_imu_that_leans_by_two_degrees_is_found_from_standing_alone() -> None
 def test_a_robot_whose_sensors_are_right_is_found_to_be_so() -> None:
     right = Calibration()
     found = fit_calibration(
-        Samples.from_states(recorded(True, 60.0, right)), Samples.from_states(recorded(False, 3.0, right))
+        ALIENGO,
+        Samples.from_states(recorded(True, 60.0, right)),
+        Samples.from_states(recorded(False, 3.0, right)),
     )
     assert np.abs(found.calibration.joint_zeros).max() < 1.5 * DEGREE
     assert np.abs(found.calibration.imu_mounting).max() < 1.0 * DEGREE
@@ -100,7 +106,7 @@ def test_what_is_set_right_is_what_was(standing: Samples) -> None:
     back = OFF.apply(OFF.as_reported(state))
     for field in ("q", "quaternion", "angular_velocity", "linear_acceleration"):
         np.testing.assert_allclose(getattr(back, field), getattr(state, field), atol=1e-12)
-    command = JointCommand(q=np.array(NOMINAL_Q))
+    command = JointCommand(q=np.array(ALIENGO.nominal_q))
     np.testing.assert_allclose(OFF.as_executed(OFF.invert(command)).q, command.q)
 
 
@@ -143,8 +149,8 @@ def test_recordings_that_tell_nothing_are_refused(hung: Samples, standing: Sampl
     with pytest.raises(
         CalibrationDataError, match="FR_hip_joint hardly moves to and fro; record quadvel excite creep"
     ):
-        fit_calibration(standing, None)
+        fit_calibration(ALIENGO, standing, None)
     with pytest.raises(CalibrationDataError, match="rad/s, expected a robot that stands still"):
-        fit_calibration(None, attrs.evolve(hung, dq=hung.dq + 0.5))
+        fit_calibration(ALIENGO, None, attrs.evolve(hung, dq=hung.dq + 0.5))
     with pytest.raises(CalibrationDataError, match="3 states, expected 100 at least"):
         Samples.from_states(recorded(False, 1.02, OFF)[:3])

@@ -29,7 +29,6 @@ from std_msgs.msg import Bool  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 
 from quadvel_bringup.nodes import process_command as node_command  # noqa: E402
-from quadvel_description.robot import NOMINAL_Q  # noqa: E402
 from quadvel_description.state import JointCommand  # noqa: E402
 from quadvel_driver import wire  # noqa: E402
 from quadvel_driver.board_state import Button, Remote  # noqa: E402
@@ -37,6 +36,7 @@ from quadvel_driver.remote import BUTTONS, OperatorCommand  # noqa: E402
 from quadvel_msgs.msg import LowCmd, LowState  # noqa: E402
 from quadvel_msgs.srv import SetMode  # noqa: E402
 from quadvel_nodes.messages import write_low_cmd  # noqa: E402
+from tests.helpers.robots import ALIENGO  # noqa: E402
 
 from .conftest import NO_REMOTE, TestBoard, standing  # noqa: E402
 
@@ -68,7 +68,9 @@ class Controller:
         self.heard[topic].append(message)
         if topic == "low_state" and self.kp is not None:
             twelve = np.full(12, self.kp)
-            command = JointCommand(q=np.array(NOMINAL_Q), kp=twelve, kd=np.full(12, 3.0), tick=message.tick)
+            command = JointCommand(
+                q=np.array(ALIENGO.nominal_q), kp=twelve, kd=np.full(12, 3.0), tick=message.tick
+            )
             answer = LowCmd()
             write_low_cmd(command if self.kp else JointCommand.damping(tick=message.tick), answer)
             self._low_cmd.publish(answer)
@@ -180,7 +182,7 @@ def test_states_and_commands_pass_through(
     start()
     states = controller.heard["low_state"]
     controller.spin_until(lambda: len(states) > 20)
-    np.testing.assert_allclose(states[-1].q, NOMINAL_Q, atol=1e-6)
+    np.testing.assert_allclose(states[-1].q, ALIENGO.nominal_q, atol=1e-6)
     stamps = [state.stamp.sec + 1e-9 * state.stamp.nanosec for state in states]
     assert abs(stamps[-1] - time.time()) < 5.0
     assert (np.diff(stamps) > 0.0).all()
@@ -299,7 +301,7 @@ def test_a_dry_run_sends_nothing_and_shows_what_it_would_send(
 ) -> None:
     process = start(dry_run=True)
     message = LowCmd()
-    write_low_cmd(JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, 55.0)), message)
+    write_low_cmd(JointCommand(q=np.array(ALIENGO.nominal_q), kp=np.full(12, 55.0)), message)
 
     controller.spin_until(lambda: controller._low_cmd.get_subscription_count() > 0)
     until = time.monotonic() + 2.5

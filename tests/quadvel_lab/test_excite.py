@@ -51,7 +51,7 @@ def play(player: MotionPlayer, begin: float, end: float, q: np.ndarray = ALIENGO
 
 
 def test_a_motion_begins_where_the_robot_is_and_ends_in_damping() -> None:
-    excitation = FootLifting(seconds=1.0)
+    excitation = FootLifting(ALIENGO, seconds=1.0)
     player, targets = MotionPlayer(excitation), excitation.targets()
     first = player.answer(state(0.0))
     np.testing.assert_allclose(first.q, ALIENGO.lie_q)
@@ -66,25 +66,25 @@ def test_a_motion_begins_where_the_robot_is_and_ends_in_damping() -> None:
 
 @pytest.mark.parametrize("then", [1.2, 0.9])
 def test_a_motion_that_would_jump_after_a_silence_or_a_step_of_the_clock_is_ended(then: float) -> None:
-    player = MotionPlayer(FootLifting(seconds=1.0))
+    player = MotionPlayer(FootLifting(ALIENGO, seconds=1.0))
     play(player, 0.0, 1.0)
     with pytest.raises(MotionError, match=r"two states is (0.200|-0.100) s, expected 0 to 0.05 s"):
         player.answer(state(then))
 
 
 def test_a_target_is_held_back_where_the_joint_is_far_from_it() -> None:
-    player = MotionPlayer(FootLifting())
+    player = MotionPlayer(FootLifting(ALIENGO))
     asked = ALIENGO.kp * (play(player, 0.0, RAMP_S).q - ALIENGO.lie_q)
     assert (np.abs(asked) <= ALIENGO.torque_limit).all()
 
 
 def test_a_robot_that_tips_over_or_leaves_its_range_ends_the_motion() -> None:
     with pytest.raises(MotionError, match=r"the trunk tilts by 0\.90 rad"):
-        MotionPlayer(FootLifting()).answer(state(0.0, tilt=0.9))
+        MotionPlayer(FootLifting(ALIENGO)).answer(state(0.0, tilt=0.9))
     q = ALIENGO.nominal_q.copy()
     q[5] = ALIENGO.upper[5] + 0.2
     with pytest.raises(MotionError, match=r"FL_calf_joint is 0\.20 rad beyond its range"):
-        MotionPlayer(FootLifting()).answer(state(0.0, q))
+        MotionPlayer(FootLifting(ALIENGO)).answer(state(0.0, q))
 
 
 def excite(*arguments: object) -> list[str]:

@@ -97,7 +97,7 @@ def other_plant(seed: int) -> tuple[RobotState, Body]:
     "seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(4, 20))]
 )
 def test_foot_lifting_goes_through_on_the_ground(seed: int) -> None:
-    states, _ = play(FootLifting(), *simulated(seed))
+    states, _ = play(FootLifting(ALIENGO), *simulated(seed))
     assert largest_tilt(states) < LEVEL
     height = np.array([foot_positions(ALIENGO, state.q) - ALIENGO.legs.hips for state in states[2500:]])[
         :, :, 2
@@ -112,18 +112,18 @@ def test_foot_lifting_goes_through_on_the_ground(seed: int) -> None:
     "seed", [*range(2), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 10))]
 )
 def test_foot_lifting_goes_through_on_another_plant(seed: int) -> None:
-    states, _ = play(FootLifting(), *other_plant(seed))
+    states, _ = play(FootLifting(ALIENGO), *other_plant(seed))
     assert largest_tilt(states) < LEVEL
 
 
 @pytest.mark.parametrize("plant", [simulated, other_plant])
 def test_a_sweep_goes_through_on_the_ground(plant: Callable[[int], tuple[RobotState, Body]]) -> None:
-    states, _ = play(Sweep(), *plant(0))
+    states, _ = play(Sweep(ALIENGO), *plant(0))
     assert largest_tilt(states) < LEVEL
 
 
 def test_the_feet_carry_the_robots_weight_and_a_lifted_foot_nothing() -> None:
-    torque = FootLifting(seconds=1.0).support_torque()
+    torque = FootLifting(ALIENGO, seconds=1.0).support_torque()
     model = load_model(ALIENGO)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
@@ -140,21 +140,21 @@ def test_the_feet_carry_the_robots_weight_and_a_lifted_foot_nothing() -> None:
 
 def test_in_the_air_nothing_is_carried() -> None:
     begin, _ = simulated(0)
-    assert not MotionPlayer(FootLifting(), hung=True).answer(begin).tau.any()
+    assert not MotionPlayer(FootLifting(ALIENGO), hung=True).answer(begin).tau.any()
 
 
 def test_the_motions_own_gains_are_sent_unless_others_are_asked_for() -> None:
     begin, _ = simulated(0)
     own, asked = (
-        MotionPlayer(FootLifting()).answer(begin),
-        MotionPlayer(FootLifting(), 60.0, 2.0).answer(begin),
+        MotionPlayer(FootLifting(ALIENGO)).answer(begin),
+        MotionPlayer(FootLifting(ALIENGO), 60.0, 2.0).answer(begin),
     )
     assert (own.kp[0], own.kd[0]) == (FootLifting.kp, FootLifting.kd)
     assert (asked.kp[0], asked.kd[0]) == (60.0, 2.0)
 
 
 def test_the_log_of_foot_lifting_gives_the_gains_and_delays_of_the_drives() -> None:
-    states, commands = play(FootLifting(), *simulated(3))
+    states, commands = play(FootLifting(ALIENGO), *simulated(3))
     state = {name: np.array([getattr(s, name) for s in states]) for name in ("q", "dq", "tau")}
     sent = {name: np.array([getattr(c, name) for c in commands]) for name in ("q", "tau", "kp", "kd")}
     t = PERIOD_S * np.arange(len(states))

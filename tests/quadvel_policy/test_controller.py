@@ -21,7 +21,6 @@ from rclpy.qos import qos_profile_sensor_data
 from std_srvs.srv import SetBool
 
 from quadvel_description.network_file import NetworkFileError
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand, Waiting
 from quadvel_msgs.srv import SetMode
@@ -31,6 +30,7 @@ from quadvel_nodes.node import StartError
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_policy.control_loop import _value_if_fresh
 from quadvel_policy.controller import Controller
+from tests.helpers.robots import ALIENGO
 
 PERIOD = 0.005
 
@@ -46,7 +46,7 @@ class Robot:
         self.velocity: float | None = None
         zeros, upright = np.zeros(12), np.array([1.0, 0.0, 0.0, 0.0])
         self.state = RobotState(
-            0.0, 0, NOMINAL_Q.copy(), zeros, zeros, upright, zeros[:3], zeros[:3], zeros[:4]
+            0.0, 0, ALIENGO.nominal_q.copy(), zeros, zeros, upright, zeros[:3], zeros[:3], zeros[:4]
         )
         self.answers = graph.listen(LowCmd, "low_cmd")
         self.reports = graph.listen(ControllerState, "controller/state")
@@ -110,7 +110,7 @@ def test_each_state_is_answered_by_its_tick(robot: Robot) -> None:
     answer = robot.stand()
     assert answer.mode == MODE_SERVO
     np.testing.assert_allclose(answer.kp, np.full(12, 150.0))
-    np.testing.assert_allclose(answer.q, NOMINAL_Q, atol=1e-6)
+    np.testing.assert_allclose(answer.q, ALIENGO.nominal_q, atol=1e-6)
     assert list(dict.fromkeys(answer.tick for answer in robot.answers)) == [5, 10, 15, 20, 25]
 
 
@@ -122,7 +122,7 @@ def test_a_simulator_that_sends_a_state_again_gets_its_answer_again(robot: Robot
 
 
 def test_faster_states_do_not_make_the_controller_faster(robot: Robot) -> None:
-    robot.state.q = NOMINAL_Q + 0.1
+    robot.state.q = ALIENGO.nominal_q + 0.1
     robot.stand()  # on the way to the nominal posture each tick has another target
     robot.answers.clear()
     for _ in range(50):

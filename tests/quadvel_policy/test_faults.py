@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from rig import FORWARD, PERIOD, STILL, Rig, assert_damping
 
-from quadvel_description.robot import NOMINAL_Q, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy import command_limits
 from quadvel_policy.command_limits import LIMITS, JointCommandLimiter
@@ -74,7 +73,7 @@ def stirring(**changes: Any) -> Callable[[Rig, int], Changes]:
 def stuck_encoder(rig: Rig, k: int) -> Changes:
     stirred(rig, k)
     still = np.arange(12) == 5
-    return {"q": np.where(still, NOMINAL_Q, rig.state.q), "dq": np.where(still, 0.01, rig.state.dq)}
+    return {"q": np.where(still, ALIENGO.nominal_q, rig.state.q), "dq": np.where(still, 0.01, rig.state.dq)}
 
 
 def stuck_tick(rig: Rig, k: int) -> Changes:
@@ -93,7 +92,7 @@ def giving_way(rig: Rig, joint: int, by: float, k: int) -> RobotState:
 
 def ideal_torque(command: JointCommand, state: RobotState) -> np.ndarray:
     """What an ideal drive gives, N m."""
-    return np.clip(command.torque(state.q, state.dq), -TORQUE_LIMIT, TORQUE_LIMIT)
+    return np.clip(command.torque(state.q, state.dq), -ALIENGO.torque_limit, ALIENGO.torque_limit)
 
 
 def silent_drive(rig: Rig, k: int) -> Changes:
@@ -165,7 +164,9 @@ CASES: dict[str, Case] = {
     "state_frozen": Case(stuck_tick, 0.035),
     "attitude_not_unit": Case(lambda rig, k: {"quaternion": np.zeros(4)}),
     "tilted": Case(lambda rig, k: {"quaternion": np.array([math.cos(0.6), 0.0, math.sin(0.6), 0.0])}),
-    "joint_out_of_range": Case(lambda rig, k: {"q": np.where(np.arange(12) == 5, UPPER + 0.5, rig.state.q)}),
+    "joint_out_of_range": Case(
+        lambda rig, k: {"q": np.where(np.arange(12) == 5, ALIENGO.upper + 0.5, rig.state.q)}
+    ),
     "joint_too_fast": Case(lambda rig, k: {"dq": np.full(12, 50.0)}),
     "encoder_inconsistent": Case(moved(5, 0.4), 2 * PERIOD),
     "encoder_frozen": Case(stuck_encoder, 0.15),
@@ -417,7 +418,7 @@ LIMIT_CASES: dict[str, tuple[float, Changes]] = {
     "target_out_of_range": (4.0, {}),
     "torque_jumps": (-4.0, {}),
     "torque_too_large": (40.0, {}),
-    "joint_at_speed_limit": (6.0, {"dq": 1.2 * VELOCITY_LIMIT}),
+    "joint_at_speed_limit": (6.0, {"dq": 1.2 * ALIENGO.velocity_limit}),
     "power_too_large": (8.0, {"dq": np.full(12, 14.0)}),
 }
 """What the policy answers, and what is changed of the state"""
@@ -432,14 +433,14 @@ def check_limit(policy: Any, name: str) -> None:
         before = command
         rig.policy.action = np.full(12, action * (-1) ** (k * (name == "torque_jumps")), np.float32)
         time, tick = rig.state.time + (k + 1) * PERIOD, rig.state.tick + 5 * (k + 1)
-        rig.seen = attrs.evolve(rig.state, time=time, tick=tick, q=NOMINAL_Q, **changes)
+        rig.seen = attrs.evolve(rig.state, time=time, tick=tick, q=ALIENGO.nominal_q, **changes)
         command = rig.supervisor.tick(TickInput(time, rig.seen, rig.velocity, FORWARD))
         torque = asked_torque(command, rig)
         power = np.maximum(torque * rig.seen.dq, 0.0).sum()
-        assert np.abs(torque).max() <= TORQUE_LIMIT.max() + 1e-9
-        assert (np.abs(torque) <= TORQUE_LIMIT + 1e-9).all()
+        assert np.abs(torque).max() <= ALIENGO.torque_limit.max() + 1e-9
+        assert (np.abs(torque) <= ALIENGO.torque_limit + 1e-9).all()
         assert power <= 1800.0 + 1e-6
-        assert not ((np.abs(rig.seen.dq) > VELOCITY_LIMIT) & (torque * rig.seen.dq > 1e-9)).any()
+        assert not ((np.abs(rig.seen.dq) > ALIENGO.velocity_limit) & (torque * rig.seen.dq > 1e-9)).any()
         assert (command.q >= command_limits.clip_to_command_range(ALIENGO, command.q) - 1e-12).all()
         if k:
             assert command.mode == before.mode

@@ -9,8 +9,8 @@ import numpy as np
 from mcap.writer import Writer
 
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_recordings.definitions import STORE
+from tests.helpers.robots import ALIENGO
 
 KP, KD = 30.0, 0.5
 
@@ -28,7 +28,7 @@ def fields(seconds: float = 4.0, rate: float = 500.0, seed: int = 0) -> dict[str
 
     motion, dq = waves(0.1)
     load, _ = waves(0.04)
-    q = NOMINAL_Q + motion
+    q = ALIENGO.nominal_q + motion
     q_des = q + 0.02 * dq + load
     tau = KP * (q_des - q) - KD * dq + random.normal(0.0, 0.1, q.shape)
     return {
@@ -66,7 +66,9 @@ def csv(path: Path, log: dict[str, Any]) -> Path:
     return path
 
 
-def mcap(path: Path, log: dict[str, Any], mode: int = 10, chunk_size: int = 2**20) -> Path:
+def mcap(
+    path: Path, log: dict[str, Any], mode: int = 10, chunk_size: int = 2**20, description: str = ""
+) -> Path:
     """low_state and low_cmd as the stack sends them, each command 2 ms after its state."""
     time_type = STORE.types["builtin_interfaces/msg/Time"]
     state_type, command_type = (STORE.types[f"quadvel_msgs/msg/{name}"] for name in ("LowState", "LowCmd"))
@@ -85,6 +87,12 @@ def mcap(path: Path, log: dict[str, Any], mode: int = 10, chunk_size: int = 2**2
             text, _ = STORE.generate_msgdef(f"quadvel_msgs/msg/{name}", ros_version=2)
             schema = writer.register_schema(f"quadvel_msgs/msg/{name}", "ros2msg", text.encode())
             channels[topic] = writer.register_channel(topic, "cdr", schema)
+        if description:
+            message = STORE.types["std_msgs/msg/String"](data=description)
+            text, _ = STORE.generate_msgdef(message.__msgtype__, ros_version=2)
+            schema = writer.register_schema(message.__msgtype__, "ros2msg", text.encode())
+            channel = writer.register_channel("/robot_description", "cdr", schema)
+            writer.add_message(channel, 0, bytes(STORE.serialize_cdr(message, message.__msgtype__)), 0)
         for k, t in enumerate(log["t"]):
             now = 1_700_000_000 * 10**9 + round(1e9 * t)
             state = state_type(

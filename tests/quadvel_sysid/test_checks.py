@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_sysid.logs.check_log import CheckedLog, check_log
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
+from tests.helpers.robots import ALIENGO
 
 sys.path.insert(0, str(Path(__file__).parent))
 from joint_logs import KD, KP, fields, npz
@@ -206,7 +206,7 @@ def test_clipped_channels_and_joints_at_rest_are_named() -> None:
 def test_names_that_contradict_the_model_are_reported() -> None:
     order = list(np.roll(np.arange(12), 1))
     moved = {name: fields()[name][:, order] for name in ("q", "dq", "tau", "q_des")}
-    warnings = texts(check_log(log(**moved)), "warning")
+    warnings = texts(check_log(attrs.evolve(log(**moved), robot=ALIENGO)), "warning")
     assert any(text.startswith("joint_names: q contradicts the model's range") for text in warnings)
     strange = attrs.evolve(log(), joints=(*JOINT_NAMES[:11], "RL_knee_joint"))
     assert "joint_names: RL_knee_joint: not among" in " ".join(texts(check_log(strange), "warning"))
@@ -258,7 +258,7 @@ def test_saturation_and_friction_are_not_damping() -> None:
 
 def test_feed_forward_torque_is_subtracted_before_the_checks() -> None:
     given = fields()
-    held = np.clip(given["q_des"], NOMINAL_Q - 0.05, NOMINAL_Q + 0.05)
+    held = np.clip(given["q_des"], ALIENGO.nominal_q - 0.05, ALIENGO.nominal_q + 0.05)
     checked = check_log(log(q_des=held, tau_ff=KP * (given["q_des"] - held)))
     assert texts(checked, "warning") == texts(checked, "refusal") == []
     assert checked.log.valid.all()

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_description import robot
 from quadvel_description.kinematics import foot_positions
 from quadvel_sysid import excitation
 from quadvel_sysid.excitation import EXCITATIONS, MAX_TORQUE_SHARE, PERIOD_S, FootLifting, propose
@@ -25,7 +24,7 @@ def eq9(t: float, leg: int) -> float:
 
 
 def test_foot_lifting_follows_equation_9() -> None:
-    targets = FootLifting(seconds=1.2).targets()
+    targets = FootLifting(ALIENGO, seconds=1.2).targets()
     for row in (0, 37, 125, 180, 250, 333, 501, 870, 1199):
         feet = foot_positions(ALIENGO, targets[row]) - ALIENGO.legs.hips
         np.testing.assert_allclose(feet[:, 2], [eq9(row * PERIOD_S, leg) for leg in range(4)], atol=1e-9)
@@ -34,23 +33,23 @@ def test_foot_lifting_follows_equation_9() -> None:
 
 @pytest.mark.parametrize("name", EXCITATIONS)
 def test_every_motion_stays_within_the_joints_range_and_speed(name: str) -> None:
-    targets = EXCITATIONS[name](seconds=6.0).targets()
+    targets = EXCITATIONS[name](ALIENGO, seconds=6.0).targets()
     assert targets.shape == (6000, 12)
-    assert (targets >= robot.COMMAND_LOWER).all()
-    assert (targets <= robot.COMMAND_UPPER).all()
-    assert (np.abs(np.diff(targets, axis=0)) <= robot.VELOCITY_LIMIT * PERIOD_S + 1e-12).all()
+    assert (targets >= ALIENGO.command_lower).all()
+    assert (targets <= ALIENGO.command_upper).all()
+    assert (np.abs(np.diff(targets, axis=0)) <= ALIENGO.velocity_limit * PERIOD_S + 1e-12).all()
 
 
 @pytest.mark.parametrize("name", ["chirp", "steps", "creep", "solo"])
 def test_motions_in_the_air_move_every_joint_by_itself(name: str) -> None:
-    speed = np.diff(EXCITATIONS[name](seconds=12.0).targets(), axis=0)
+    speed = np.diff(EXCITATIONS[name](ALIENGO, seconds=12.0).targets(), axis=0)
     assert (speed.std(axis=0) > 0.0).all()
     correlation = np.corrcoef(speed.T) - np.eye(12)
     assert np.abs(correlation).max() < 0.98
 
 
 def test_solo_moves_one_joint_at_a_time() -> None:
-    moving = np.abs(np.diff(EXCITATIONS["solo"](seconds=12.0).targets(), axis=0)) > 1e-6
+    moving = np.abs(np.diff(EXCITATIONS["solo"](ALIENGO, seconds=12.0).targets(), axis=0)) > 1e-6
     assert moving.sum(axis=1).max() == 1
     assert moving.any(axis=0).all()
 
@@ -59,11 +58,11 @@ def test_target_requests_at_most_its_share_of_the_torque_limit() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
         q, dq, target = rng.normal(0, 1, 12), rng.normal(0, 10, 12), rng.normal(0, 3, 12)
-        asked = 30.0 * (excitation.limit_torque(target, q, dq, 30.0, 0.5) - q) - 0.5 * dq
-        assert (np.abs(asked) <= MAX_TORQUE_SHARE * robot.TORQUE_LIMIT + 1e-9).all()
-    calm = robot.NOMINAL_Q + 0.1
+        asked = 30.0 * (excitation.limit_torque(ALIENGO, target, q, dq, 30.0, 0.5) - q) - 0.5 * dq
+        assert (np.abs(asked) <= MAX_TORQUE_SHARE * ALIENGO.torque_limit + 1e-9).all()
+    calm = ALIENGO.nominal_q + 0.1
     np.testing.assert_array_equal(
-        excitation.limit_torque(calm, robot.NOMINAL_Q, np.zeros(12), 30.0, 0.5), calm
+        excitation.limit_torque(ALIENGO, calm, ALIENGO.nominal_q, np.zeros(12), 30.0, 0.5), calm
     )
 
 

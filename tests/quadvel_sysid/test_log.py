@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 
 from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_sysid.logs.check_log import check_logs
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
 from quadvel_sysid.logs.readers import raw
+from tests.helpers.robots import ALIENGO, GO2
 
 sys.path.insert(0, str(Path(__file__).parent))
 from joint_logs import csv, fields, mcap, npz
@@ -301,3 +303,17 @@ def test_command_is_in_force_from_its_time_despite_rounding(tmp_path: Path) -> N
     log = read_log(npz(tmp_path / "a.npz"))
     at = (log.t_cmd - 0.1) + 0.1
     assert (log.command_rows(at) == np.arange(len(at))).all()
+
+
+def test_a_log_is_that_of_the_aliengo_unless_it_names_another_robot_or_one_is_asked_for(
+    tmp_path: Path,
+) -> None:
+    own, go2 = npz(tmp_path / "a.npz"), tmp_path / "go2.mcap"
+    mcap(go2, fields(), description=GO2.urdf_file.read_text())
+    assert read_log(own).robot is ALIENGO
+    assert read_log(own, robot="go2").robot is GO2
+    assert read_log(go2).robot is GO2
+    with pytest.raises(LogError, match=r"go2\.mcap: robot is 'go2', expected 'aliengo'"):
+        read_log(go2, robot="aliengo")
+    with pytest.raises(LogError, match=r"go2\.mcap: robot is 'go2', expected 'aliengo' as of .*a\.npz"):
+        check_logs([read_log(own)], [read_log(go2)])

@@ -9,7 +9,6 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.simulator import Simulator
@@ -73,10 +72,10 @@ def _hung(friction, seconds=5.0, seed=0):
     simulator.reset("stand", seed=seed)
     rng = np.random.default_rng(seed)
     rows, targets = [], []
-    target = NOMINAL_Q.copy()
+    target = ALIENGO.nominal_q.copy()
     for k in range(round(1000 * seconds)):
         if k % 80 == 0:
-            aim = NOMINAL_Q + rng.uniform(-0.3, 0.3, 12)
+            aim = ALIENGO.nominal_q + rng.uniform(-0.3, 0.3, 12)
         target = target + 0.02 * (aim - target)
         simulator.command(JointCommand(q=target, kp=np.full(12, 30.0), kd=np.full(12, 0.5)))
         state = simulator.state()

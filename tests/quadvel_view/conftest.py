@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from quadvel_description import robot
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_recordings.definitions import STORE
 from quadvel_recordings.recorded import _default
 from quadvel_view.picture import TOPICS
+from tests.helpers.robots import ALIENGO
 
 SPEED = 0.5  # m/s
 SECONDS = 3.0
@@ -51,7 +51,7 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> Path:
             schema = writer.register_schema(TOPICS[topic], "ros2msg", text.encode())
             channels[topic] = writer.register_channel(topic, "cdr", schema)
         for step in range(round(50 * SECONDS) + 1):
-            angles = robot.NOMINAL_Q + 0.1 * np.sin(0.2 * step)
+            angles = ALIENGO.nominal_q + 0.1 * np.sin(0.2 * step)
             joints = message("sensor_msgs/msg/JointState", name=list(JOINT_NAMES), position=angles)
             times = {name: float("nan") if step < 50 else 1.0 for name in ("period_p99_ms", "compute_p99_us")}
             state = message("quadvel_msgs/msg/ControllerState", mode_name="walk", **times)

@@ -17,7 +17,6 @@ from quadvel_actuator.parameters import ActuatorParameters, Effect
 from quadvel_description.arrays import Array
 from quadvel_description.network_input import InputLayout
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy.modes import Policy
 from quadvel_sim.simulator import Simulator
@@ -494,7 +493,7 @@ DEFECTS: dict[str, Maker] = {
     "command_out_of_range": lambda s, r: Plant({}, fastest=(3.2, 3.6, 4.0, 4.4)[s]),
 }
 """Maker of each kind, from strength (0 to 3) and random generator."""
-NOMINAL = NOMINAL_Q
+NOMINAL = ALIENGO.nominal_q
 
 
 def make_defect(kind: str, strength: int, rng: Rng) -> Defect:

@@ -12,6 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.state import RobotState
 from quadvel_driver.find_calibration import CalibrationDataError, CalibrationFit, Samples, fit_calibration
 from quadvel_nodes.messages import read_low_state
@@ -41,6 +43,9 @@ def calibrate_command(
             help="Recording of the robot standing on a level floor: for the IMU mounting.",
         ),
     ] = None,
+    robot: Annotated[
+        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or a robot.yaml.")
+    ] = DEFAULT_ROBOT,
     out: Annotated[Path, typer.Option(metavar="<file>", help="The file to write.")] = Path(
         "out/calibration.yaml"
     ),
@@ -59,7 +64,7 @@ def calibrate_command(
     if hung is None and standing is None:
         raise ValueError("no recording given: name one with --hung, with --standing, or both")
     output_file(out)
-    found = fit_calibration(_samples(hung), _samples(standing))
+    found = fit_calibration(load_robot(robot), _samples(hung), _samples(standing))
     console = Console(soft_wrap=True)
     console.print(_table(found))
     if standing is not None:

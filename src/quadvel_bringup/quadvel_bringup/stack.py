@@ -120,14 +120,14 @@ class Stack:
         low_level = LOW_LEVELS[self.low_level]
         policy = None if self.policy is None else str(self.policy.resolve())
         urgent: Parameters = URGENT if low_level.urgent else {}
-        robot = _given(robot=_absolute_file(self.robot))
+        robot = _given(robot=absolute_file(self.robot))
         followers: dict[str, Parameters] = {
             "estimator": {**urgent, **robot, **_given(kind=self.estimator)},
             "controller": {**low_level.controller, **urgent, **robot, **_given(policy=policy)},
             "command_mux": _given(),
         }
         actuator = None if self.actuator is None else str(self.actuator.resolve())
-        simulated = _given(terrain=self.terrain, world=_absolute_file(self.world), actuator_file=actuator)
+        simulated = _given(terrain=self.terrain, world=absolute_file(self.world), actuator_file=actuator)
         if simulated and not low_level.simulation:
             raise ValueError(f"{', '.join(simulated)}: only a simulated robot has this, not {self.low_level}")
         serving = {name: {**values, **robot} for name, values in low_level.nodes.items()}
@@ -148,7 +148,7 @@ class Stack:
         Returns:
             Arguments by name of the node.
         """
-        robot = _given(robot=_absolute_file(self.robot))
+        robot = _given(robot=absolute_file(self.robot))
         nodes = self.node_parameters() | ({VIEW: robot} if view else {})
         return {name: ros_arguments(name, values, self.parameters) for name, values in nodes.items()}
 
@@ -164,8 +164,15 @@ class Stack:
         return {name: process_command(name, words) for name, words in self.arguments(view).items()}
 
 
-def _absolute_file(chosen: str | None) -> str | None:
-    """Return the absolute path of the file of a world or robot, or the name of a shipped one unchanged."""
+def absolute_file(chosen: str | None) -> str | None:
+    """Make the file of a world or robot absolute.
+
+    Args:
+        chosen: The file, the name of a shipped one, or None.
+
+    Returns:
+        The absolute path; a name and None unchanged.
+    """
     return str(Path(chosen).resolve()) if chosen and Path(chosen).suffix else chosen
 
 

@@ -64,6 +64,18 @@ def load_robot(robot: str) -> Robot:
     return structure_record(Robot, {**fields, "links": links, "folder": str(file.parent)}, file)
 
 
+def is_robot(chosen: str) -> bool:
+    """Return whether this names a robot, not another kind of file such as a URDF.
+
+    Args:
+        chosen: Name or path.
+
+    Returns:
+        True for a shipped robot, a folder, or a YAML file.
+    """
+    return chosen in shipped_robots() or Path(chosen).suffix == ".yaml" or Path(chosen).is_dir()
+
+
 def robot_of_file(path: Path, named: str | None, asked: str | None) -> Robot:
     """Load the robot of a recording or another file.
 

@@ -17,11 +17,10 @@ import attrs
 import numpy as np
 from scipy.optimize import least_squares
 
-from quadvel_description import robot
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.kinematics import foot_positions, rotate, rotate_inverse
 from quadvel_description.quadruped import GRAVITY, JOINT_NAMES, KINDS, LEGS
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot
 from quadvel_description.state import RobotState
 
 from .calibration import Calibration
@@ -93,10 +92,11 @@ class Samples:
         return cls(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def fit_calibration(suspended: Samples | None, standing: Samples | None) -> CalibrationFit:
+def fit_calibration(robot: Robot, suspended: Samples | None, standing: Samples | None) -> CalibrationFit:
     """Fit the calibration to the records; parameters without a record keep zero offset.
 
     Args:
+        robot: The robot.
         suspended: States of a suspended robot that moves its joints slowly; None if there are none.
         standing: States of a robot that stands on a level floor; None if there are none.
 
@@ -113,15 +113,15 @@ def fit_calibration(suspended: Samples | None, standing: Samples | None) -> Cali
         _check_standing(standing)
     for _ in range(ALTERNATIONS):
         if standing is not None:
-            mounting, unevenness = _imu_mounting(standing, calibration)
+            mounting, unevenness = _imu_mounting(robot, standing, calibration)
             calibration = attrs.evolve(calibration, imu_mounting=mounting)
         if suspended is not None:
-            zeros, errors = _joint_zeros(suspended, calibration)
+            zeros, errors = _joint_zeros(robot, suspended, calibration)
             calibration = attrs.evolve(calibration, joint_zeros=zeros)
     return CalibrationFit(calibration, errors, unevenness)
 
 
-def holding_torque(q: Array, down: Array) -> Array:
+def holding_torque(robot: Robot, q: Array, down: Array) -> Array:
     """Compute the joint torques that hold legs in the air against gravity.
 
         tau_j = -a_j . sum over bodies b beyond j of (c_b - p_j) x (m_b g e_down)
@@ -129,18 +129,19 @@ def holding_torque(q: Array, down: Array) -> Array:
     with joint axis a_j, joint position p_j, and centre of mass c_b.
 
     Args:
+        robot: The robot.
         q: Joint angles, (n, 12), rad.
         down: Direction of gravity in the trunk frame, unit vectors, (n, 3).
 
     Returns:
         Torques, (n, 12), N m.
     """
-    return np.hstack([_leg_torque(q[:, 3 * leg : 3 * leg + 3], down, leg) for leg in range(4)])
+    return np.hstack([_leg_torque(robot, q[:, 3 * leg : 3 * leg + 3], down, leg) for leg in range(4)])
 
 
-def _leg_torque(q: Array, down: Array, leg: int) -> Array:
+def _leg_torque(robot: Robot, q: Array, down: Array, leg: int) -> Array:
     """Return the holding torque of one leg, (n, 3), N m."""
-    (joints, centres), axes, masses = _leg_masses(q, LEGS[leg])
+    (joints, centres), axes, masses = _leg_masses(robot, q, LEGS[leg])
     torque = np.zeros_like(q)
     for joint in range(3):
         for body in range(joint, 3):
@@ -149,12 +150,14 @@ def _leg_torque(q: Array, down: Array, leg: int) -> Array:
     return torque
 
 
-def _leg_masses(q: Array, leg: str) -> tuple[tuple[list[Array], list[Array]], list[Array], list[float]]:
+def _leg_masses(
+    robot: Robot, q: Array, leg: str
+) -> tuple[tuple[list[Array], list[Array]], list[Array], list[float]]:
     """Return joint positions and centres of mass (n, 3) m, joint axes (n, 3) and masses (kg) of a leg, trunk frame."""
     position, rotation = np.zeros((len(q), 3)), np.broadcast_to(np.eye(3), (len(q), 3, 3))
     joints, centres, axes, masses = [], [], [], []
     for k, kind in enumerate(KINDS):
-        link = next(link for link in robot.LINKS if link.name == f"{leg}_{kind}")
+        link = next(link for link in robot.links if link.name == f"{leg}_{kind}")
         body = robot.combined_inertial(link.name)
         position = position + rotation @ np.array(link.origin)
         rotation = rotation @ _rotation_about(q[:, k], 0 if link.axis == "x" else 1)
@@ -176,15 +179,15 @@ def _rotation_about(angle: Array, axis: int) -> Array:
     return matrices
 
 
-def _joint_zeros(suspended: Samples, calibration: Calibration) -> tuple[Array, Array]:
+def _joint_zeros(robot: Robot, suspended: Samples, calibration: Calibration) -> tuple[Array, Array]:
     """Return the encoder zeros and their standard errors, (12,) rad each, for the IMU tilt of `calibration`."""
     down = rotate(calibration.mounting, rotate_inverse(suspended.quaternion, -UP))
-    legs = [_leg_zeros(suspended, down, leg, calibration.joint_zeros) for leg in range(4)]
+    legs = [_leg_zeros(robot, suspended, down, leg, calibration.joint_zeros) for leg in range(4)]
     zeros, errors = np.array(legs).transpose(1, 0, 2).reshape(2, 12)
     return zeros, errors
 
 
-def _leg_zeros(suspended: Samples, down: Array, leg: int, start: Array) -> tuple[Array, Array]:
+def _leg_zeros(robot: Robot, suspended: Samples, down: Array, leg: int, start: Array) -> tuple[Array, Array]:
     """Return zeros and standard errors of one leg, (3,) rad each.
 
     Least squares over the zeros z, torque scales k, Coulomb friction c and viscous friction d of
@@ -196,6 +199,7 @@ def _leg_zeros(suspended: Samples, down: Array, leg: int, start: Array) -> tuple
     ZERO_PRIOR_RAD. The covariance is s^2 (J^T J)^-1 with the residual variance s^2, at least 1.
 
     Args:
+        robot: The robot.
         suspended: States of a suspended robot.
         down: Direction of gravity in the trunk frame, (n, 3).
         leg: Index of the leg.
@@ -214,7 +218,7 @@ def _leg_zeros(suspended: Samples, down: Array, leg: int, start: Array) -> tuple
     def residuals(x: Array) -> Array:
         """Return the weighted residuals for zeros, torque scales, Coulomb and viscous friction, (3,) each."""
         zeros, scale, dry, viscous = x.reshape(4, 3)
-        model = scale * _leg_torque(q - zeros, down, leg) + dry * np.sign(dq) + viscous * dq
+        model = scale * _leg_torque(robot, q - zeros, down, leg) + dry * np.sign(dq) + viscous * dq
         return np.concatenate(
             [
                 ((tau - model) / TORQUE_NOISE_NM).ravel(),
@@ -223,7 +227,9 @@ def _leg_zeros(suspended: Samples, down: Array, leg: int, start: Array) -> tuple
             ]
         )
 
-    guess = np.concatenate([start[joints], np.ones(3), robot.FRICTION[joints], robot.DAMPING[joints]])
+    guess = np.concatenate(
+        [start[joints], np.ones(3), robot.joint_friction[joints], robot.joint_damping[joints]]
+    )
     fit = least_squares(residuals, guess, x_scale=np.repeat([0.1, 0.1, 0.5, 0.5], 3))
     variance = np.square(fit.fun[:-6]).sum() / (fit.fun.size - 6 - fit.x.size)
     errors = np.sqrt(max(variance, 1.0) * np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
@@ -240,13 +246,13 @@ def _is_steady(dq: Array) -> Bools:
     return np.asarray(around < 0.5)
 
 
-def _imu_mounting(standing: Samples, calibration: Calibration) -> tuple[Array, float]:
+def _imu_mounting(robot: Robot, standing: Samples, calibration: Calibration) -> tuple[Array, float]:
     """Return the tilt of the IMU, (2,) rad, and the largest distance of a foot from their plane, m.
 
     The tilt is the rotation from the vertical that the IMU shows to the normal of the plane of the
     feet (the singular vector of the smallest singular value of the centred foot positions).
     """
-    feet = foot_positions(ALIENGO, standing.q - calibration.joint_zeros).mean(axis=0)
+    feet = foot_positions(robot, standing.q - calibration.joint_zeros).mean(axis=0)
     centred = feet - feet.mean(axis=0)
     normal = np.linalg.svd(centred)[2][2]
     normal = normal * np.sign(normal[2])

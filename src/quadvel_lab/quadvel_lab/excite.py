@@ -24,14 +24,16 @@ from quadvel_bringup.node_output import PrefixedOutput
 from quadvel_bringup.nodes import Parameters, enclave, process_command, ros_arguments
 from quadvel_bringup.preflight import check_node
 from quadvel_bringup.processes import ProcessGroup, StopSignals
-from quadvel_bringup.stack import PARAMETERS
-from quadvel_description import robot
+from quadvel_bringup.stack import PARAMETERS, absolute_file
 from quadvel_description.kinematics import roll_pitch
 from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import Robot, load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_eval.report import read_json
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
 from quadvel_recordings.output import atomic_write, output_file
+from quadvel_recordings.reading import DESCRIPTION_TOPIC
 from quadvel_sysid.excitation import EXCITATIONS, PERIOD_S, Excitation, limit_torque, propose
 
 RAMP_S = 1.5
@@ -52,7 +54,11 @@ MAX_STATE_GAP_S = 0.05
 """Longest time between two states; after a longer one the motion would jump."""
 ANSWER_TIMEOUT_S = 2.0
 """Time after which the simulator repeats a state."""
-RECORDED_TOPICS = {"/low_state": "quadvel_msgs/msg/LowState", "/low_cmd": "quadvel_msgs/msg/LowCmd"}
+RECORDED_TOPICS = {
+    "/low_state": "quadvel_msgs/msg/LowState",
+    "/low_cmd": "quadvel_msgs/msg/LowCmd",
+    DESCRIPTION_TOPIC: "std_msgs/msg/String",
+}
 
 
 class MotionError(RuntimeError):
@@ -81,6 +87,7 @@ class MotionPlayer:
         hung: bool | None = None,
     ) -> None:
 
+        self._robot = excitation.robot
         self._targets = excitation.targets()
         self._kp = excitation.kp if kp is None else kp
         self._kd = excitation.kd if kd is None else kd
@@ -109,7 +116,7 @@ class MotionPlayer:
         Raises:
             MotionError: The robot left the range of the motion, or states are missing.
         """
-        _check(state)
+        _check(self._robot, state)
         if self._begin is None:
             self._begin, self._last = state, state.time
         gap, self._last = state.time - self._last, state.time
@@ -121,7 +128,7 @@ class MotionPlayer:
         if self.is_done:
             return JointCommand.damping(tick=state.tick)
         target, tau = self._current_targets(self._begin.q)
-        target = limit_torque(target, state.q, state.dq, self._kp, self._kd, tau)
+        target = limit_torque(self._robot, target, state.q, state.dq, self._kp, self._kd, tau)
         return JointCommand(
             q=target, tau=tau, kp=np.full(12, self._kp), kd=np.full(12, self._kd), tick=state.tick
         )
@@ -137,12 +144,12 @@ class MotionPlayer:
         return self._targets[row], self._support[row]
 
 
-def _check(state: RobotState) -> None:
+def _check(robot: Robot, state: RobotState) -> None:
     """Raise MotionError if tilt or joint angles leave the range of the motions."""
     tilt = np.abs(roll_pitch(state.quaternion)).max()
     if tilt > MAX_TILT_RAD:
         raise MotionError(f"the trunk tilts by {tilt:.2f} rad, expected at most {MAX_TILT_RAD}")
-    beyond = np.maximum(robot.LOWER - state.q, state.q - robot.UPPER)
+    beyond = np.maximum(robot.lower - state.q, state.q - robot.upper)
     if beyond.max() > JOINT_MARGIN_RAD:
         joint = JOINT_NAMES[int(beyond.argmax())]
         raise MotionError(f"{joint} is {beyond.max():.2f} rad beyond its range")
@@ -163,6 +170,9 @@ def excite_command(
         Literal["sim", "external"],
         typer.Option(help="What serves low_state and low_cmd; external: a running robot."),
     ] = "sim",
+    robot: Annotated[
+        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or a robot.yaml.")
+    ] = DEFAULT_ROBOT,
     hung: Annotated[
         bool | None,
         typer.Option(
@@ -216,13 +226,14 @@ def excite_command(
         return
     if motion not in EXCITATIONS:
         raise ValueError(f"motion is {motion!r}, expected one of {', '.join(EXCITATIONS)}")
-    excitation = EXCITATIONS[motion]() if seconds is None else EXCITATIONS[motion](seconds=seconds)
+    chosen = load_robot(robot)
+    excitation = EXCITATIONS[motion](chosen, **({} if seconds is None else {"seconds": seconds}))
     path = out or Path("out/excite") / f"{motion}.mcap"
     if path.exists():
         raise FileExistsError(f"{path} exists already; name another file with --out")
     output_file(path)
     in_the_air = excitation.hung if hung is None else hung
-    parameters: dict[str, Any] = {"hung": in_the_air, "seed": seed}
+    parameters: dict[str, Any] = {"robot": absolute_file(robot), "hung": in_the_air, "seed": seed}
     if actuator is not None:
         parameters["actuator_file"] = str(actuator.resolve())
     nodes = {}

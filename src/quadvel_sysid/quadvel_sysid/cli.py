@@ -19,7 +19,8 @@ from typer.core import TyperCommand
 from typing_extensions import override
 
 from quadvel_actuator.parameters import ActuatorParameters
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import is_robot, load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_recordings.output import output_folder
 
 from .logs.check_log import CheckedLog, check_logs
@@ -122,7 +123,7 @@ def identify(
         str | None,
         typer.Option(
             metavar="<name|file>",
-            help="Replay the commands on this robot's legs before and after: aliengo, go2, or an MJCF or URDF file.",
+            help="The robot, aliengo, go2 or a robot.yaml, or an MJCF or URDF file; its legs replay the commands before and after.",
             show_default="no replay",
         ),
     ] = None,
@@ -175,10 +176,12 @@ def identify(
         output_folder(out)
         return_freed_arrays_to_system()
         names = ColumnMap() if columns is None else ColumnMap.load(columns)
-        read = partial(read_log, joints=joints, names=names, topics=Topics(state_topic, command_topic))
-        parameters = (
-            ActuatorParameters.of(ALIENGO) if base is None else ActuatorParameters.load(ALIENGO, base)
-        )
+        kind = robot if robot is not None and is_robot(robot) else None
+        topics = Topics(state_topic, command_topic)
+        read = partial(read_log, joints=joints, names=names, topics=topics, robot=kind)
+        parameters = None
+        if base is not None:
+            parameters = ActuatorParameters.load(load_robot(kind or DEFAULT_ROBOT), base)
         options = IdentifyOptions(gains=gains, base=parameters, robot=robot)
         found = _identify(logs, holdout or [], read, options, cores, messages)
         _write(found, out, force, messages)

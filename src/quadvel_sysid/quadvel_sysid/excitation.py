@@ -8,7 +8,7 @@ state is known.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import attrs
@@ -16,19 +16,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from typing_extensions import override
 
-from quadvel_description import robot
 from quadvel_description.arrays import Array
 from quadvel_description.command_range import clip_to_command_range
 from quadvel_description.kinematics import foot_jacobians, inverse_kinematics
 from quadvel_description.quadruped import GRAVITY
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot
 
 PERIOD_S = 0.001
 """s between two targets."""
 MAX_TORQUE_SHARE = 0.7
 """Share of the torque limit that a target may request."""
-_FOOT_HEIGHT_M = -0.4
-"""m; height of the feet relative to the hips, standing."""
 _LEG_PHASE = np.array([0.0, 2.0, 2.0, 0.0])
 """Phase k_{i,0} of each leg in Eq. 9: diagonal legs move together."""
 
@@ -44,15 +41,23 @@ class Excitation(ABC):
 
     Attributes:
         hung: Whether the robot has to be suspended, with its feet in the air.
-        kp: Position gain that the motion is designed for, N m/rad.
-        kd: Speed gain that the motion is designed for, N m s/rad.
+        robot: The robot.
         seconds: Duration, s.
     """
 
     hung: ClassVar[bool] = True
-    kp: ClassVar[float] = robot.KP
-    kd: ClassVar[float] = robot.KD
+    robot: Robot
     seconds: float
+
+    @property
+    def kp(self) -> float:
+        """Position gain that the motion is designed for, N m/rad."""
+        return self.robot.kp
+
+    @property
+    def kd(self) -> float:
+        """Speed gain that the motion is designed for, N m s/rad."""
+        return self.robot.kd
 
     def targets(self) -> Array:
         """Compute the joint targets, within range and speed limits.
@@ -60,7 +65,8 @@ class Excitation(ABC):
         Returns:
             (n, 12) targets, rad, one row every `PERIOD_S`.
         """
-        return limit_speed(clip_to_command_range(ALIENGO, self._joint_targets(self._times())))
+        targets = clip_to_command_range(self.robot, self._joint_targets(self._times()))
+        return limit_speed(self.robot, targets)
 
     def support_torque(self) -> Array:
         """Compute the feed-forward torque that carries the robot on its feet.
@@ -119,18 +125,20 @@ class OnGround(Excitation):
     def _joint_targets(self, t: Array) -> Array:
         share, height = self._foot_lift(t)
         feet = np.empty((len(t), 4, 3))
-        feet[...] = ALIENGO.legs.hips
-        feet[..., 1] += ALIENGO.legs.lateral
-        feet[..., 2] = _FOOT_HEIGHT_M + height[:, None] * share
-        return inverse_kinematics(ALIENGO, feet)
+        legs = self.robot.legs
+        feet[...] = legs.hips
+        feet[..., 1] += legs.lateral
+        standing = -round(self.robot.nominal_height - self.robot.foot_radius, 6)  # m, relative to the hips
+        feet[..., 2] = standing + height[:, None] * share
+        return inverse_kinematics(self.robot, feet)
 
     @override
     def support_torque(self) -> Array:
         # Virtual work: the foot force f_z = m g share gives the torque -J_z^T f_z. The share of a foot
         # falls linearly with its lift.
         down = 1.0 - self._foot_lift(self._times())[0]
-        force = robot.MASS * GRAVITY * down / down.sum(axis=1, keepdims=True)
-        jacobians = foot_jacobians(ALIENGO, self._joint_targets(self._times()))
+        force = self.robot.mass * GRAVITY * down / down.sum(axis=1, keepdims=True)
+        jacobians = foot_jacobians(self.robot, self._joint_targets(self._times()))
         return -(jacobians[:, :, 2] * force[..., None]).reshape(-1, 12)
 
 
@@ -196,11 +204,11 @@ class Chirp(Excitation):
         low, high = self.frequencies
         growth = np.log(high / low) / self.seconds
         frequency = low * np.exp(growth * t)[:, None] * np.linspace(0.75, 1.25, 12)
-        fastest = 0.5 * robot.VELOCITY_LIMIT / (2 * np.pi * frequency)
+        fastest = 0.5 * self.robot.velocity_limit / (2 * np.pi * frequency)
         swing = np.minimum(self.amplitude, fastest) * np.sin(
             2 * np.pi * np.cumsum(frequency, axis=0) * PERIOD_S
         )
-        return robot.NOMINAL_Q + _fade_in(t) * swing
+        return self.robot.nominal_q + _fade_in(t) * swing
 
 
 @attrs.frozen
@@ -217,7 +225,7 @@ class Solo(Excitation):
 
     def _joint_targets(self, t: Array) -> Array:
         turn = self.seconds / 12
-        targets = np.tile(robot.NOMINAL_Q, (len(t), 1))
+        targets = np.tile(self.robot.nominal_q, (len(t), 1))
         for joint in range(12):
             mine = (joint * turn <= t) & (t < (joint + 1) * turn)
             s = (t[mine] - joint * turn) / turn
@@ -250,7 +258,7 @@ class RandomSteps(Excitation):
             row, offset = 0, 0.0
             while row < n:
                 hold = round(rng.uniform(*self.holds) / PERIOD_S)
-                targets[row : row + hold, joint] = robot.NOMINAL_Q[joint] + offset
+                targets[row : row + hold, joint] = self.robot.nominal_q[joint] + offset
                 row += hold
                 size = np.exp(rng.uniform(*np.log(self.sizes)))
                 offset = np.clip(offset - np.copysign(size, offset) * rng.choice([1, 1, -1]), -0.5, 0.5)
@@ -274,10 +282,10 @@ class Creep(Excitation):
     def _joint_targets(self, t: Array) -> Array:
         period = np.linspace(*self.periods, 12)
         triangle = 2 * np.abs(2 * ((t[:, None] / period + 0.25) % 1.0) - 1.0) - 1.0
-        return robot.NOMINAL_Q - _fade_in(t) * self.amplitude * triangle
+        return self.robot.nominal_q - _fade_in(t) * self.amplitude * triangle
 
 
-EXCITATIONS: dict[str, Callable[..., Excitation]] = {
+EXCITATIONS: dict[str, type[Excitation]] = {
     "foot-lifting": FootLifting,
     "sweep": Sweep,
     "chirp": Chirp,
@@ -300,29 +308,33 @@ def _fade_in(t: Array) -> Array:
     return s * s * (3.0 - 2.0 * s)
 
 
-def limit_speed(targets: Array) -> Array:
+def limit_speed(robot: Robot, targets: Array) -> Array:
     """Limit the speed of targets to the joints' velocity limits.
 
     Args:
+        robot: The robot.
         targets: (n, 12) targets, rad, one row every `PERIOD_S`.
 
     Returns:
         (n, 12) targets; a step that is too fast becomes a ramp.
     """
     slowed = targets.copy()
-    reach = robot.VELOCITY_LIMIT * PERIOD_S
+    reach = robot.velocity_limit * PERIOD_S
     for row in range(1, len(slowed)):
         before = slowed[row - 1]
         slowed[row] = np.minimum(np.maximum(slowed[row], before - reach), before + reach)
     return slowed
 
 
-def limit_torque(target: Array, q: Array, dq: Array, kp: float, kd: float, tau: ArrayLike = 0.0) -> Array:
+def limit_torque(
+    robot: Robot, target: Array, q: Array, dq: Array, kp: float, kd: float, tau: ArrayLike = 0.0
+) -> Array:
     """Limit a target so that it requests at most `MAX_TORQUE_SHARE` of the torque limit.
 
     Solves |kp (target - q) - kd dq + tau| <= bound for the target.
 
     Args:
+        robot: The robot.
         target: (12,) target, rad.
         q: (12,) measured angles, rad.
         dq: (12,) measured speeds, rad/s.
@@ -333,7 +345,7 @@ def limit_torque(target: Array, q: Array, dq: Array, kp: float, kd: float, tau: 
     Returns:
         (12,) limited target, rad.
     """
-    bound = MAX_TORQUE_SHARE * robot.TORQUE_LIMIT
+    bound = MAX_TORQUE_SHARE * robot.torque_limit
     offset = kd * dq - np.asarray(tau)
     return np.clip(target, q + (offset - bound) / kp, q + (offset + bound) / kp)
 
@@ -435,7 +447,7 @@ def _excitation_for_signal(signal: str) -> str:
 
 def _make_proposal(kind: str, separates: tuple[str, ...]) -> Proposal:
     """A proposal with the usual duration, or a longer one for slow effects."""
-    usual = EXCITATIONS[kind]().seconds
+    usual: float = attrs.fields_dict(EXCITATIONS[kind])["seconds"].default  # type: ignore[assignment]
     slow = [_MIN_DURATION_S[name] for name in separates if kind == "sweep" and name in _MIN_DURATION_S]
     return Proposal(kind, max([usual, *slow]), separates, _REASONS[kind])
 

@@ -15,7 +15,6 @@ import attrs
 import numpy as np
 
 from quadvel_actuator.parameters import ActuatorParameters
-from quadvel_description.robot import ALIENGO
 
 from .data.clocks import known_offsets
 from .data.dataset import Dataset, Progress, no_progress
@@ -26,7 +25,7 @@ from .data.split import MIN_BLOCK_S, DataSplit
 from .export.replay import Load, Replay, find_load
 from .logs.check_log import check_logs
 from .logs.findings import Finding
-from .logs.log import Log
+from .logs.log import Log, LogError
 from .model.delays import central_equivalent_delay, quantised_delays
 from .model.fit import fit
 from .model.torque_model import Model
@@ -116,7 +115,9 @@ def identify_dataset(
 def _identify_once(dataset: Dataset, options: IdentifyOptions, progress: Progress) -> Identification:
     """Identify the actuators from one division of the logs."""
     # 1. Samples, data split and plain EAM.
-    base = options.base or ActuatorParameters.of(ALIENGO)
+    base = options.base or ActuatorParameters.of(dataset.robot)
+    if base.robot != dataset.robot.name:
+        raise LogError(f"base: robot is {base.robot!r}, expected {dataset.robot.name!r} as of the logs")
     load = find_load(dataset, options.robot)
     progress(0.02, "gains and delays")
     prepared, notes = _preprocess(dataset, load, options.search)

@@ -56,14 +56,13 @@ def read_run(path: Path, gains: tuple[float, float] | None = None, robot: str | 
     """
     is_recording = path.suffix in RECORDINGS or path.is_dir()
     types = topics(path) if is_recording else {}
-    named = described_robot(recorded_description(path)) if is_recording else None
-    kind = robot_of_file(path, named, robot)
     if STATE in types.values():
-        return _own_run(path, kind, types)
-    log = read_log(path)
+        named = described_robot(recorded_description(path))
+        return _own_run(path, robot_of_file(path, named, robot), types)
+    log = read_log(path, robot=robot)
     if gains is None and (log.kp is None or log.kd is None):
         raise RecordingError(f"{path}: kp, kd: the commands hold no gains, expected --gains KP KD")
-    return _run_of_log(kind, log.with_gains(gains), _others_imu(path, types, log))
+    return _run_of_log(log.with_gains(gains), _others_imu(path, types, log))
 
 
 def _own_run(path: Path, robot: Robot, types: Mapping[str, str]) -> Run:
@@ -172,11 +171,12 @@ def _others_imu(path: Path, types: Mapping[str, str], log: Log) -> Imu | None:
     return Imu(*(_rows(found, field) for field in ("quaternion", "gyroscope", "accelerometer")))
 
 
-def _run_of_log(robot: Robot, log: Log, imu: Imu | None) -> Run:
+def _run_of_log(log: Log, imu: Imu | None) -> Run:
     """Run of a joint log; the commands of a log hold position if their stiffness is above zero."""
     start = float(log.t[0])
     assert log.kp is not None
     assert log.kd is not None
+    assert log.robot is not None
     none = np.zeros(log.q_des.shape)
 
     def floats(values: Floats | None) -> Array:
@@ -194,7 +194,7 @@ def _run_of_log(robot: Robot, log: Log, imu: Imu | None) -> Run:
     )
     return Run(
         name=log.name,
-        robot=robot,
+        robot=log.robot,
         joints=log.joints,
         time=floats(log.t) - start,
         q=floats(log.q),

@@ -103,12 +103,12 @@ def record_foot_lifting(seed: int, seconds: float) -> Log:
     """
     simulator = RecordingSimulator(SimulatorConfig(robot=ALIENGO, seed=seed))
     simulator.reset("stand")
-    start, targets = simulator.state().q, FootLifting(seconds).targets()[::SIMULATOR_STEPS_PER_TICK]
+    start, targets = simulator.state().q, FootLifting(ALIENGO, seconds).targets()[::SIMULATOR_STEPS_PER_TICK]
     kp, kd = np.full(12, robot.KP), np.full(12, robot.KD)
     rise = np.linspace(0.0, 1.0, round(TRANSITION_TIME_S / CONTROL_PERIOD_S))[:, None]
     for target in np.vstack([start + rise * (targets[0] - start), targets]):
         state = simulator.state()
-        q = limit_torque(target, state.q, state.dq, robot.KP, robot.KD)
+        q = limit_torque(ALIENGO, target, state.q, state.dq, robot.KP, robot.KD)
         simulator.command(JointCommand(q=q, kp=kp, kd=kd))
         simulator.step(SIMULATOR_STEPS_PER_TICK)
     return simulator.log(f"Eq. 9, seed {seed}", TRANSITION_TIME_S)

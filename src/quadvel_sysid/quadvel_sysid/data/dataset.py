@@ -8,6 +8,9 @@ from itertools import chain, pairwise
 import attrs
 import numpy as np
 
+from quadvel_description.robot import Robot, load_robot
+from quadvel_description.robot_name import UNNAMED_ROBOT
+
 from ..logs.check_log import CheckedLog
 from ..logs.excerpts import cut_excerpts
 from ..logs.findings import Finding
@@ -53,6 +56,11 @@ class Dataset:
     def logs(self) -> tuple[Log, ...]:
         """All logs, those to fit first."""
         return (*self.train, *self.heldout)
+
+    @property
+    def robot(self) -> Robot:
+        """The robot of the logs; UNNAMED_ROBOT if it is unknown."""
+        return self.train[0].robot or load_robot(UNNAMED_ROBOT)
 
     def is_heldout(self, recording: int) -> bool:
         """Return whether a recording is held out.

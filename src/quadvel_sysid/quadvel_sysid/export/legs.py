@@ -26,7 +26,7 @@ from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf
 from quadvel_description.arrays import Array, Bools
-from quadvel_description.robot import load_robot, shipped_robots
+from quadvel_description.robot import is_robot, load_robot, shipped_robots
 
 from ..data.log_signals import as_double
 from ..logs.log import Log, LogError
@@ -57,7 +57,7 @@ class Legs:
         """Load a robot's description.
 
         Args:
-            robot: `aliengo`, `go2`, or the path of an MJCF or URDF file.
+            robot: `aliengo`, `go2`, or the path of a robot.yaml, an MJCF or a URDF file.
             joints: Names of the joints, which the description has to hold.
 
         Returns:
@@ -150,7 +150,7 @@ class Legs:
 
 def _load_robot(robot: str) -> mujoco.MjModel:
     """Load a shipped description, or a file."""
-    if robot in shipped_robots():
+    if is_robot(robot):
         return mjcf.load_model(load_robot(robot))
     path = Path(robot)
     if not path.is_file():

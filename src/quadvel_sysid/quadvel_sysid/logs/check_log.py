@@ -100,8 +100,11 @@ def check_logs(
 
 
 def _with_joints_of_first(log: Log, logs: Sequence[Log]) -> Log:
-    """The log with the joints of the first; raises LogError unless both or none hold torque."""
+    """The log with the joints of the first; raises LogError unless robots and kinds of torque agree."""
     first = logs[0]
+    if log.robot is not first.robot and log.robot and first.robot:
+        expected = f"expected {first.robot.name!r} as of {first.name}"
+        raise LogError(f"{log.name}: robot is {log.robot.name!r}, {expected}")
     if (log.tau is None) != (first.tau is None):
         lacking, other = (log, first) if log.tau is None else (first, log)
         raise LogError(f"{lacking.name}: tau: the field is missing, expected it as in {other.name}")

@@ -12,6 +12,7 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Bools, Floats, Indices
+from quadvel_description.robot import Robot
 
 TIME_TOLERANCE_S = 1e-9
 """s; a command sent at most this long after an instant is in force at it (round-off of summed
@@ -74,6 +75,7 @@ class Log:
         remarks: Assumptions of the reader, one sentence each.
         warnings: Defects that the reader found, one sentence each.
         derived: Fields that the file did not hold, such as a `dq` computed from `q`.
+        robot: The robot; None if it is unknown.
     """
 
     name: str
@@ -95,6 +97,7 @@ class Log:
     remarks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     derived: tuple[str, ...] = ()
+    robot: Robot | None = None
 
     def __attrs_post_init__(self) -> None:
         for name in self.joints:

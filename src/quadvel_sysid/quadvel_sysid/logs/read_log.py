@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from .log import Log
+import attrs
+
+from quadvel_description.robot import robot_of_file
+from quadvel_description.robot_name import described_robot
+from quadvel_recordings.reading import recorded_description
+
+from .log import Log, LogError
 from .readers import lerobot
 from .readers.columns import ColumnMap
 from .readers.recordings import Topics, read_recording
@@ -17,6 +23,7 @@ def read_log(
     joints: Sequence[str] | None = None,
     names: ColumnMap | None = None,
     topics: Topics | None = None,
+    robot: str | None = None,
 ) -> Log:
     """Read a measured joint log.
 
@@ -25,12 +32,14 @@ def read_log(
         joints: Names of the joints to keep, or None for all.
         names: Names of the fields in a table.
         topics: Topics of a recording that hold the log.
+        robot: Name or file of the robot; None for the one that a recording names.
 
     Returns:
         The log, with checked shapes, numbers and times.
 
     Raises:
-        LogError: The file cannot be used; the message names the file and the field.
+        LogError: The file cannot be used, or is that of another robot; the message names the file
+            and the field.
         FileNotFoundError: There is no such file.
     """
     path = Path(path)
@@ -38,6 +47,11 @@ def read_log(
         raise FileNotFoundError(f"{path}: there is no such file")
     if path.suffix in (".mcap", ".db3", ".bag") or (path.is_dir() and lerobot.find_root(path) != path):
         log = read_recording(path, topics or Topics())
+        named = described_robot(recorded_description(path))
     else:
-        log = read_table(path, names or ColumnMap())
+        log, named = read_table(path, names or ColumnMap()), None
+    try:
+        log = attrs.evolve(log, robot=robot_of_file(path, named, robot))
+    except ValueError as error:
+        raise LogError(str(error)) from None
     return log if joints is None else log.select_joints(joints)

@@ -9,7 +9,6 @@ import numpy as np
 
 from quadvel_description.arrays import Floats, Indices
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import LOWER, UPPER
 
 from ..findings import Finding, format_names
 from ..log import Log
@@ -230,10 +229,13 @@ def joint_ranges(log: Log) -> Iterator[Finding]:
         strange = tuple(name for name in log.joints if name not in JOINT_NAMES)
         text = f"joint_names: {format_names(strange)}: not among the model's joints, though {named[0]} is"
         yield Finding("warning", "joint_names", strange, text)
-    outside = {}
+    if log.robot is None:
+        return
+    outside, robot = {}, log.robot
     for name in named:
         low, high = np.percentile(log.q[:, log.joints.index(name)], [1, 99])
-        lower, upper = LOWER[JOINT_NAMES.index(name)], UPPER[JOINT_NAMES.index(name)]
+        joint = JOINT_NAMES.index(name)
+        lower, upper = robot.lower[joint], robot.upper[joint]
         if low < lower - RANGE_MARGIN_RAD or high > upper + RANGE_MARGIN_RAD:
             outside[name] = f"{name} {low:.2f} to {high:.2f} (the model's: {lower:.2f} to {upper:.2f})"
     if outside:
