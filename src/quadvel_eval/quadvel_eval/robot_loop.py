@@ -57,7 +57,7 @@ class TrueVelocity:
         return self._simulator.truth().linear_velocity, np.zeros((3, 3))
 
 
-def make_estimator(kind: str, simulator: Simulator, file: Path) -> Estimator:
+def make_estimator(kind: str, simulator: Simulator, file: Path | None) -> Estimator:
     """Create a velocity estimator.
 
     Args:

@@ -89,7 +89,7 @@ def make_simulator(setup: Setup, seed: int) -> Simulator:
     robot, rng = load_robot(setup.robot), np.random.default_rng(seed)
     drawn = _draw_plant(robot, rng) if setup.randomised else {}
     if setup.actuator is not None:
-        drawn["actuator"] = ActuatorParameters.load(ALIENGO, setup.actuator)
+        drawn["actuator"] = ActuatorParameters.load(robot, setup.actuator)
     simulator = Simulator(
         SimulatorConfig(**{"robot": robot, "terrain": terrain, "seed": seed, **drawn, **setup.plant})
     )

@@ -15,8 +15,10 @@ import attrs
 import numpy as np
 from matplotlib.figure import Figure
 
-from quadvel_estimator.learned import SHIPPED_MODEL
-from quadvel_policy.policy_file import SHIPPED_POLICY
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
+from quadvel_estimator.learned import shipped_estimator
+from quadvel_policy.policy_file import shipped_policy
 
 from ..pool import Call
 from ..walk import Setup
