@@ -64,3 +64,16 @@ def test_an_rclpy_too_old_for_real_time_on_two_cores_is_named(monkeypatch: pytes
     monkeypatch.setattr(doctor.util, "find_spec", lambda name: object() if name == "rclpy" else None)
     finding = next(f for f in doctor.examine() if f.subject == "ROS 2")
     assert "rclpy 7.1.4" in finding.text
+
+
+@pytest.mark.parametrize(
+    ("robot", "good", "text"),
+    [
+        ("aliengo", True, "AlienGo: crl_eam.onnx, estimator.onnx"),
+        ("go2", False, "policies/go2/crl_eam.onnx: no such file is shipped for the robot 'go2'"),
+        ("spot", False, "robot: found 'spot', expected aliengo, go2 or the path of a robot.yaml"),
+    ],
+)
+def test_what_is_shipped_for_a_robot_is_named(robot: str, good: bool, text: str) -> None:
+    finding = doctor.robot_files(robot)
+    assert (finding.good, text in finding.text) == (good, True), finding

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -218,17 +219,21 @@ def begin(
 
 
 @app.command(rich_help_panel=ROBOT)
-def doctor() -> None:
+def doctor(
+    robot: Annotated[
+        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or a robot.yaml.")
+    ] = DEFAULT_ROBOT,
+) -> None:
     """Check what is installed on this machine and what it can run.
 
     \b
     For example:
       quadvel doctor
     """
-    from .doctor import abilities, examine
+    from .doctor import abilities, examine, robot_files
 
     findings = []
-    for finding in examine():
+    for finding in chain(examine(), [robot_files(robot)]):
         findings.append(finding)
         print(f"{'ok  ' if finding.good else 'note'} {finding.subject:12} {finding.text}", flush=True)
     for ability, possible in abilities(findings):

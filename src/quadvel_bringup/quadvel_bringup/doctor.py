@@ -56,6 +56,27 @@ def examine() -> Iterator[Finding]:
     yield _robot()
 
 
+def robot_files(robot: str) -> Finding:
+    """Check the description of a robot, and that a policy and an estimator are shipped for it.
+
+    Args:
+        robot: Name of the robot, or path of a robot.yaml.
+
+    Returns:
+        The finding; not good if a file is missing or wrong.
+    """
+    try:
+        from quadvel_description.robot import load_robot
+        from quadvel_estimator.learned import shipped_estimator
+        from quadvel_policy.policy_file import shipped_policy
+
+        found = load_robot(robot)
+        files = [shipped(found).name for shipped in (shipped_policy, shipped_estimator)]
+    except (ImportError, OSError, ValueError) as error:
+        return Finding("robot files", False, str(error))
+    return Finding("robot files", True, f"{found.title}: {', '.join(files)}")
+
+
 def _robot() -> Finding:
     """Check for a running robot and its actuator model."""
     try:
