@@ -9,29 +9,33 @@ import pytest
 from quadvel_description import kinematics, mjcf
 from quadvel_description.frames import BASE
 from quadvel_description.quadruped import JOINT_NAMES, LEGS
-from quadvel_description.robot import load_robot
+from quadvel_description.robot import Robot, load_robot, shipped_robots
 from quadvel_description.urdf_generator import generate_urdf
-from tests.helpers.robots import ALIENGO
 
 KEEP_FIXED_LINKS = '<mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
 
 
+@pytest.fixture(scope="module", params=shipped_robots())
+def robot(request: pytest.FixtureRequest) -> Robot:
+    return load_robot(request.param)
+
+
 @pytest.fixture(scope="module")
-def imported() -> mujoco.MjModel:
+def imported(robot: Robot) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(
-        ALIENGO.urdf_file.read_text().replace("</robot>", f"{KEEP_FIXED_LINKS}</robot>")
+        robot.urdf_file.read_text().replace("</robot>", f"{KEEP_FIXED_LINKS}</robot>")
     )
 
 
 @pytest.fixture(scope="module")
-def simulated() -> mujoco.MjModel:
-    return mjcf.load_model(ALIENGO, mjcf.Plant(plane=False))
+def simulated(robot: Robot) -> mujoco.MjModel:
+    return mjcf.load_model(robot, mjcf.Plant(plane=False))
 
 
-def _postures(imported: mujoco.MjModel, simulated: mujoco.MjModel, count: int):
+def _postures(robot: Robot, imported: mujoco.MjModel, simulated: mujoco.MjModel, count: int):
     """Postures, and the URDF's and the MJCF's MjData in them, with the trunk at the origin."""
     first, second = mujoco.MjData(imported), mujoco.MjData(simulated)
-    for q in np.random.default_rng(0).uniform(ALIENGO.lower, ALIENGO.upper, size=(count, 12)):
+    for q in np.random.default_rng(0).uniform(robot.lower, robot.upper, size=(count, 12)):
         for name, angle in zip(JOINT_NAMES, q, strict=True):
             first.joint(name).qpos = angle
         second.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *q]
@@ -41,19 +45,19 @@ def _postures(imported: mujoco.MjModel, simulated: mujoco.MjModel, count: int):
         yield q, first, second
 
 
-def test_urdf_and_mjcf_weigh_the_same(imported, simulated):
-    assert imported.body_mass.sum() == pytest.approx(ALIENGO.mass, abs=1e-9)
-    assert simulated.body_mass.sum() == pytest.approx(ALIENGO.mass, abs=1e-9)
+def test_urdf_and_mjcf_weigh_the_same(robot, imported, simulated):
+    assert imported.body_mass.sum() == pytest.approx(robot.mass, abs=1e-9)
+    assert simulated.body_mass.sum() == pytest.approx(robot.mass, abs=1e-9)
 
 
-def test_urdf_and_mjcf_have_the_same_centre_of_mass(imported, simulated):
-    for _, first, second in _postures(imported, simulated, 20):
+def test_urdf_and_mjcf_have_the_same_centre_of_mass(robot, imported, simulated):
+    for _, first, second in _postures(robot, imported, simulated, 20):
         np.testing.assert_allclose(first.body(BASE).subtree_com, second.body("trunk").subtree_com, atol=1e-9)
 
 
-def test_urdf_and_mjcf_have_the_same_inertia_about_every_joint(imported, simulated):
+def test_urdf_and_mjcf_have_the_same_inertia_about_every_joint(robot, imported, simulated):
     rows = [imported.joint(name).dofadr[0] for name in JOINT_NAMES]
-    for _, first, second in _postures(imported, simulated, 5):
+    for _, first, second in _postures(robot, imported, simulated, 5):
         inertia = []
         for model, data in ((imported, first), (simulated, second)):
             mujoco.mj_crb(model, data)
@@ -63,16 +67,16 @@ def test_urdf_and_mjcf_have_the_same_inertia_about_every_joint(imported, simulat
         np.testing.assert_allclose(inertia[0][np.ix_(rows, rows)], inertia[1][6:, 6:], atol=1e-9)
 
 
-def test_urdf_and_mjcf_put_every_foot_at_the_same_place(imported, simulated):
-    for q, first, second in _postures(imported, simulated, 50):
-        for leg, foot in zip(LEGS, kinematics.foot_positions(ALIENGO, q), strict=True):
+def test_urdf_and_mjcf_put_every_foot_at_the_same_place(robot, imported, simulated):
+    for q, first, second in _postures(robot, imported, simulated, 50):
+        for leg, foot in zip(LEGS, kinematics.foot_positions(robot, q), strict=True):
             np.testing.assert_allclose(
                 first.body(f"{leg}_foot").xpos, second.geom(f"{leg}_foot").xpos, atol=1e-9
             )
             np.testing.assert_allclose(first.body(f"{leg}_foot").xpos, foot, atol=1e-9)
 
 
-def test_urdf_and_mjcf_show_the_same_shapes(imported, simulated):
+def test_urdf_and_mjcf_show_the_same_shapes(robot, imported, simulated):
     def shapes(model: mujoco.MjModel, data: mujoco.MjData, collide: bool) -> np.ndarray:
         rows = [
             [model.geom_type[i], *model.geom_size[i], *data.geom_xpos[i], *np.abs(data.geom_xmat[i])]
@@ -81,30 +85,30 @@ def test_urdf_and_mjcf_show_the_same_shapes(imported, simulated):
         ]
         return np.array(sorted(rows))
 
-    _, first, second = next(_postures(imported, simulated, 1))
+    _, first, second = next(_postures(robot, imported, simulated, 1))
     expected = shapes(simulated, second, False)
     np.testing.assert_allclose(shapes(imported, first, True), expected, atol=1e-9)
     assert imported.ngeom == 2 * len(expected)  # a visual and a collision shape each
 
 
-def test_limits_in_the_urdf_are_those_of_the_joint_table():
+def test_limits_in_the_urdf_are_those_of_the_joint_table(robot):
     joints = {
         joint.get("name"): joint
-        for joint in ElementTree.fromstring(ALIENGO.urdf_file.read_text()).iter("joint")
+        for joint in ElementTree.fromstring(robot.urdf_file.read_text()).iter("joint")
     }
     for i, name in enumerate(JOINT_NAMES):
         limit = joints[name].find("limit")
         found = [float(limit.get(key)) for key in ("lower", "upper", "effort", "velocity")]
         assert found == [
-            ALIENGO.lower[i],
-            ALIENGO.upper[i],
-            ALIENGO.torque_limit[i],
-            ALIENGO.velocity_limit[i],
+            robot.lower[i],
+            robot.upper[i],
+            robot.torque_limit[i],
+            robot.velocity_limit[i],
         ]
 
 
-def test_links_form_one_tree_below_a_root_without_inertia():
-    tree = ElementTree.fromstring(ALIENGO.urdf_file.read_text())
+def test_links_form_one_tree_below_a_root_without_inertia(robot):
+    tree = ElementTree.fromstring(robot.urdf_file.read_text())
     links = [link.get("name") for link in tree.iter("link")]
     children = [joint.find("child").get("link") for joint in tree.iter("joint")]
     parents = [joint.find("parent").get("link") for joint in tree.iter("joint")]

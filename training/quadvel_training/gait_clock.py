@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-FOOT_PHASES = np.array([0.0, 0.5, 0.5, 0.0])  # cycles, in the order of robot.LEGS: FR with RL, FL with RR
+FOOT_PHASES = np.array([0.0, 0.5, 0.5, 0.0])  # cycles, in the order of quadruped.LEGS: FR with RL, FL with RR
 FREQUENCY = (1.9, 0.55, 4.2)  # Hz at rest, increase in Hz per m/s, highest Hz
 DUTY = (0.68, 0.07, 0.36)  # share of a cycle on the ground at rest, decrease per m/s, least
 START_PHASE = 0.6  # cycles since touchdown of the pair FR and RL in stance: it lifts off first

@@ -337,17 +337,3 @@ def _leg_geometry(robot: Robot) -> LegGeometry:
         calf=calf,
         knees=to_array(None, np.sign(robot.nominal_q[2::3])),
     )
-
-
-# Leftover: the AlienGo's numbers as constants, until every user takes a `Robot`.
-ALIENGO = load_robot("aliengo")
-NOMINAL_Q, LIE_Q = ALIENGO.nominal_q, ALIENGO.lie_q
-NOMINAL_HEIGHT, LIE_HEIGHT = ALIENGO.nominal_height, ALIENGO.lie_height
-SUSPENDED_HEIGHT = ALIENGO.suspended_height
-KP, KD = ALIENGO.kp, ALIENGO.kd
-LOWER, UPPER = ALIENGO.lower, ALIENGO.upper
-COMMAND_LOWER, COMMAND_UPPER = ALIENGO.command_lower, ALIENGO.command_upper
-TORQUE_LIMIT, VELOCITY_LIMIT = ALIENGO.torque_limit, ALIENGO.velocity_limit
-ARMATURE, FRICTION, DAMPING = ALIENGO.armature, ALIENGO.joint_friction, ALIENGO.joint_damping
-FOOT_RADIUS, MASS, LINKS = ALIENGO.foot_radius, ALIENGO.mass, ALIENGO.links
-combined_inertial = ALIENGO.combined_inertial

@@ -13,7 +13,7 @@ _zeros = attrs.Factory(lambda: np.zeros(12))
 
 @attrs.define
 class RobotState:
-    """State of the robot at `time`. Joint order as in `robot.JOINT_NAMES`.
+    """State of the robot at `time`. Joint order as in `quadruped.JOINT_NAMES`.
 
     Attributes:
         time: Time of the sample, s.

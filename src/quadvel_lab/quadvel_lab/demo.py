@@ -17,6 +17,7 @@ from rich.console import Console
 from quadvel_bringup.doctor import GL_PACKAGES, gl_backend, video_encoder
 from quadvel_bringup.preflight import check_stack
 from quadvel_bringup.stack import Stack
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_eval import demo_figures, demo_summary
 from quadvel_eval.following.tour import TourSetup
 from quadvel_eval.following.tour_cli import run_tour
@@ -49,6 +50,9 @@ def demo_command(
         Literal["walk", "follow"],
         typer.Argument(help="A walk in all directions, or following a person through a world."),
     ] = "walk",
+    robot: Annotated[
+        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or a robot.yaml.")
+    ] = DEFAULT_ROBOT,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -62,7 +66,7 @@ def demo_command(
     low_level: Annotated[
         Literal["sim", "board"],
         typer.Option(
-            help="The robot: simulated, or simulated behind the AlienGo's UDP interface and its driver."
+            help="The robot: simulated, or simulated behind the interface of its board and its driver."
         ),
     ] = "sim",
     loss: Annotated[
@@ -107,11 +111,13 @@ def demo_command(
     if what == "follow":
         folder = output_folder(out or Path("out/tour" if tour else "out/follow"))
         if tour:
-            good = run_tour(TourSetup(world=world, path_length=metres, seed=seed), folder, console)
+            good = run_tour(
+                TourSetup(robot=robot, world=world, path_length=metres, seed=seed), folder, console
+            )
         else:
-            good = follow(folder, world, seconds, view, console)
+            good = follow(folder, robot, world, seconds, view, console)
         raise typer.Exit(0 if good else 1)
-    stack = _stack(low_level, loss, jitter, lockstep, actuator)
+    stack = _stack(robot, low_level, loss, jitter, lockstep, actuator)
     check_stack(stack)
     folder = output_folder(out or Path("out/demo"))
     recorded = folder / "demo.mcap"
@@ -153,11 +159,13 @@ def _check_options(context: typer.Context, demo: str) -> None:
             raise ValueError(f"--{name.replace('_', '-')} belongs to {' and '.join(demos)}, not to {demo}")
 
 
-def _stack(low_level: str, loss: float, jitter: float, lockstep: bool, actuator: Path | None) -> Stack:
+def _stack(
+    robot: str, low_level: str, loss: float, jitter: float, lockstep: bool, actuator: Path | None
+) -> Stack:
     """Return the stack of a scripted walk."""
     network = {"network_loss": loss, "network_jitter": 1e-3 * jitter}
     given = {name: value for name, value in network.items() if value}
-    return Stack(low_level=low_level, use_sim_time=lockstep, network=given, actuator=actuator)
+    return Stack(robot=robot, low_level=low_level, use_sim_time=lockstep, network=given, actuator=actuator)
 
 
 def _report(summary: dict[str, Any], console: Console) -> None:

@@ -100,11 +100,12 @@ class FollowedWalk(RecordedRun):
         self._bar.update(self._task, completed=passed, description=words[:24])
 
 
-def follow(folder: Path, world: str, seconds: float, view: bool, console: Console) -> bool:
+def follow(folder: Path, robot: str, world: str, seconds: float, view: bool, console: Console) -> bool:
     """Run, evaluate and write the results.
 
     Args:
         folder: Folder for the results.
+        robot: Name of a shipped robot, or path of a robot.yaml.
         world: Name or file of the world.
         seconds: Duration, s.
         view: Whether to add the operator page.
@@ -113,7 +114,7 @@ def follow(folder: Path, world: str, seconds: float, view: bool, console: Consol
     Returns:
         Whether the robot neither fell nor touched anything.
     """
-    stack, loaded = Stack(world=world), World.load(world)
+    stack, loaded = Stack(robot=robot, world=world), World.load(world)
     check_stack(stack)
     recorded = folder / "follow.mcap"
     x, y, _ = loaded.laser.position.tolist()
