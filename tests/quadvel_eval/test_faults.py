@@ -63,7 +63,7 @@ def test_the_campaign_is_large_and_each_of_its_cases_can_be_injected() -> None:
     ],
 )
 def test_the_reaction_is_as_expected(name: str) -> None:
-    result = run_case(case(name), seed=3)
+    result = run_case("aliengo", case(name), seed=3)
     assert result.wrong == []
     assert result.torque <= 1.0
 
@@ -82,18 +82,21 @@ def test_a_missing_guard_is_detected(
         return Stack(*arguments, guards=tuple(one for one in GUARDS if one is not guard))
 
     monkeypatch.setattr(campaigns, "Stack", without)
-    wrong = "; ".join(run_case(case(name), seed=0).wrong)
+    wrong = "; ".join(run_case("aliengo", case(name), seed=0).wrong)
     assert sentence in wrong
 
 
 def test_equal_seeds_give_equal_runs() -> None:
-    first, again, other = (run_case(case("imu stuck walk"), seed) for seed in (1, 1, 2))
+    first, again, other = (run_case("aliengo", case("imu stuck walk"), seed) for seed in (1, 1, 2))
     assert attrs.asdict(first) == attrs.asdict(again)
     assert attrs.asdict(first) != attrs.asdict(other)
 
 
 def test_the_result_is_written_as_file_table_and_picture(tmp_path: Path) -> None:
-    runs = [run_case(case("clock wrong stance"), seed=0), run_case(case("imu off stance"), seed=0)]
+    runs = [
+        run_case("aliengo", case("clock wrong stance"), seed=0),
+        run_case("aliengo", case("imu off stance"), seed=0),
+    ]
     runs[0].wrong.append("a test")
     write_campaign(tmp_path, runs)
     kept = json.loads((tmp_path / "faults.json").read_text())
@@ -108,12 +111,12 @@ def test_the_result_is_written_as_file_table_and_picture(tmp_path: Path) -> None
 
 def test_unknown_cases_raise() -> None:
     with pytest.raises(ValueError, match=r"no case contains 'wheel'.* processor; .*lie_down") as refused:
-        run_campaign(1, "wheel")
+        run_campaign("aliengo", 1, "wheel")
     assert len(str(refused.value)) < 500
 
 
 def test_the_command_reports_unexpected_reactions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bad = run_case(case("clock wrong stance"), seed=0)
+    bad = run_case("aliengo", case("clock wrong stance"), seed=0)
     bad.wrong.append("it is purple")
     monkeypatch.setattr("quadvel_eval.cli.run_campaign", lambda *_: [bad])
     answer = CliRunner().invoke(app, ["faults", "--out", str(tmp_path)])

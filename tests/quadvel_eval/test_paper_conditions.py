@@ -41,7 +41,7 @@ def test_every_condition_is_a_plant_that_stands() -> None:
 
 
 def test_the_plants_of_the_gap_differ_from_that_of_training_in_one_thing() -> None:
-    drives = {one.level: one.plant["actuator"] for one in drive_conditions()}
+    drives = {one.level: one.plant["actuator"] for one in drive_conditions(ALIENGO)}
     trained = drives.pop("as in training")
     assert trained == ActuatorParameters.of(ALIENGO)
     assert {len(p.effects) + (p.best_pair != trained.best_pair) for p in drives.values()} == {1}

@@ -22,6 +22,7 @@ from quadvel_eval.paper.symmetry import Symmetry
 from quadvel_policy.policy_file import SHIPPED_POLICY
 from quadvel_sysid.data.plain_model import fit_eam
 from quadvel_sysid.data.signals import Samples
+from tests.helpers.robots import ALIENGO
 
 ONE = Study(seeds=1)
 
@@ -90,7 +91,7 @@ def test_a_push_comes_while_the_robot_walks(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_eq_9_gives_back_the_gains_of_the_drives() -> None:
-    log = record_foot_lifting(seed=0, seconds=2.0)
+    log = record_foot_lifting(ALIENGO, seed=0, seconds=2.0)
     found = fit_eam(Samples.of([log]), np.ones(log.q.shape, bool))
     assert 30.0 * (found.gains[0, 0] - 1.0) == pytest.approx(-0.706, abs=0.05)
     assert found.mse == pytest.approx(0.066, rel=0.05)

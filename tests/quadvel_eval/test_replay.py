@@ -139,8 +139,8 @@ def test_in_open_loop_the_true_model_stays_closer_than_an_ideal_one(
     run: tuple[JointRecord, Callable[[float], Truth]],
 ) -> None:
     joints, truth = run
-    true = open_loop_error(ActuatorParameters.of(ALIENGO), joints, truth, 0.2, SECONDS)
-    ideal = open_loop_error(ActuatorParameters.ideal(ALIENGO), joints, truth, 0.2, SECONDS)
+    true = open_loop_error(ALIENGO, ActuatorParameters.of(ALIENGO), joints, truth, 0.2, SECONDS)
+    ideal = open_loop_error(ALIENGO, ActuatorParameters.ideal(ALIENGO), joints, truth, 0.2, SECONDS)
     assert true.stretches == ideal.stretches == 4
     assert true.q < 0.003
     assert true.dq < 0.7 * ideal.dq  # the noise of the torque alone makes half of it
@@ -152,7 +152,7 @@ def test_in_open_loop_the_true_model_stays_closer_than_an_ideal_one(
 
 def test_a_stretch_without_history_is_not_replayed(run: tuple[JointRecord, Callable[[float], Truth]]) -> None:
     with pytest.raises(ValueError, match=r"nothing to replay between 0\.00 and 0\.25 s"):
-        open_loop_error(ActuatorParameters.of(ALIENGO), *run, 0.0, 0.25)
+        open_loop_error(ALIENGO, ActuatorParameters.of(ALIENGO), *run, 0.0, 0.25)
 
 
 def test_the_gap_is_the_mean_distance_of_the_mean_velocities() -> None:

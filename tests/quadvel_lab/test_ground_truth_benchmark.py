@@ -106,7 +106,7 @@ def test_what_a_plant_reports_is_the_torque_that_its_joints_get() -> None:
 def test_the_noise_of_hidden_drives_is_that_of_the_stacks_model() -> None:
     parameters = ActuatorParameters.of(ALIENGO)
     still = DryGear(slip=ZERO, stick=ZERO)
-    drives = HiddenDrives(parameters, still, DT, seed=0)
+    drives = HiddenDrives(parameters, still, ALIENGO.torque_limit, DT, seed=0)
     torque = [drives.step(ZERO, ZERO, ZERO, 30.0, 0.5) for _ in range(2000)]
     assert np.var(torque) == pytest.approx(parameters.torque_noise, rel=0.05)
 

@@ -212,7 +212,7 @@ def record_log(
 ) -> None:
     """Record a walk on a plant whose drives have an effect that training never saw, as a log for `quadvel identify`."""
     try:
-        gap.write_walk_log(policy, plant, out)
+        gap.write_walk_log(load_robot(DEFAULT_ROBOT), policy, plant, out)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
     _written(out)

@@ -24,7 +24,8 @@ from rich.table import Table
 from typing_extensions import override
 
 from quadvel_description.onnx_format import float_value, message, serialise
-from quadvel_description.robot import ALIENGO, NOMINAL_Q, Robot
+from quadvel_description.robot import Robot, load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
 from quadvel_driver.board_state import BoardState
@@ -97,7 +98,7 @@ def bench_simulator() -> dict[str, Any]:
         Realtime factors.
     """
     robot = make_simulator(Setup(), seed=0)
-    command = JointCommand(q=NOMINAL_Q.copy(), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+    command = JointCommand(q=load_robot(DEFAULT_ROBOT).nominal_q, kp=np.full(12, 100.0), kd=np.full(12, 3.0))
 
     def step() -> None:
         robot.command(command)
@@ -121,9 +122,9 @@ def bench_world() -> dict[str, Any]:
         Realtime factor, and time of a scan in us.
     """
     campus = World.load("campus")
-    robot = Simulator(SimulatorConfig(robot=ALIENGO, world=campus))
+    robot = Simulator(SimulatorConfig(robot=load_robot(DEFAULT_ROBOT), world=campus))
     robot.reset("stand")
-    command = JointCommand(q=NOMINAL_Q.copy(), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+    command = JointCommand(q=load_robot(DEFAULT_ROBOT).nominal_q, kp=np.full(12, 100.0), kd=np.full(12, 3.0))
 
     def step() -> None:
         robot.command(command)
@@ -160,7 +161,7 @@ def bench_policy() -> dict[str, Any]:
     Returns:
         Medians and a 99th percentile, us.
     """
-    network = PolicyFile(ALIENGO)
+    network = PolicyFile(load_robot(DEFAULT_ROBOT))
     observation = np.zeros(network.metadata.observation.size, np.float32)
     idle = _idle_network()
 
@@ -203,7 +204,7 @@ def bench_estimator() -> dict[str, Any]:
     Returns:
         Median and 99th percentile, us.
     """
-    network, state = LearnedEstimator(ALIENGO), make_simulator(Setup(), seed=0).state()
+    network, state = LearnedEstimator(load_robot(DEFAULT_ROBOT)), make_simulator(Setup(), seed=0).state()
     previous_action = np.zeros(12)
     return _percentiles(_time_calls(lambda: network.update(state, previous_action), 5000))
 
@@ -216,7 +217,7 @@ def bench_packets() -> dict[str, Any]:
     """
     twelve = np.full(12, 10)
     state = BoardState(make_simulator(Setup(), seed=0).state(), twelve, twelve, twelve)
-    command = JointCommand(q=NOMINAL_Q.copy(), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+    command = JointCommand(q=load_robot(DEFAULT_ROBOT).nominal_q, kp=np.full(12, 100.0), kd=np.full(12, 3.0))
     jobs: dict[str, Callable[[], object]] = {}
     for robot, packets in (("", wire), ("go2_", dds_wire)):
         of_state, of_command = packets.encode_state(state), packets.encode_command(command)
@@ -251,7 +252,8 @@ def bench_supervisor() -> dict[str, Any]:
     Returns:
         Median and 99th percentile, us.
     """
-    robot, timed = make_simulator(Setup(), seed=0), _TimedSupervisor(ALIENGO, PolicyFile(ALIENGO))
+    chosen, robot = load_robot(DEFAULT_ROBOT), make_simulator(Setup(), seed=0)
+    timed = _TimedSupervisor(chosen, PolicyFile(chosen))
     walking = RobotLoop(robot, timed, TrueVelocity(robot))
     walking.start_walking()
     timed.seconds.clear()

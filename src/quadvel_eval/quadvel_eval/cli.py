@@ -10,9 +10,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from quadvel_actuator import ActuatorParameters
-from quadvel_description.robot import ALIENGO
-from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
-from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
+from quadvel_estimator.learned import LearnedEstimator, shipped_estimator
+from quadvel_policy.policy_file import PolicyFile, shipped_policy
 from quadvel_recordings.output import output_file, output_folder
 
 from . import bench
@@ -33,23 +34,30 @@ ClusterOption = Annotated[
 ]
 
 
+RobotOption = Annotated[
+    str, typer.Option("--robot", metavar="<name|file>", help="The robot: aliengo, go2 or a robot.yaml.")
+]
+
+
 def eval_command(
     grid: Annotated[Literal["quick", "paper"], typer.Option(help="Grid of commands.")],
     out: Annotated[
         Path, typer.Option(metavar="<folder>", help="Folder for eval.json, eval.csv and eval.png.")
     ] = Path("out/eval"),
+    robot: RobotOption = DEFAULT_ROBOT,
     policy: Annotated[
-        Path, typer.Option(metavar="<file>", help="ONNX file of the policy.", show_default="the shipped one")
-    ] = SHIPPED_POLICY,
+        Path | None,
+        typer.Option(metavar="<file>", help="ONNX file of the policy.", show_default="the shipped one"),
+    ] = None,
     estimator: Annotated[
         Literal["learned", "kalman", "truth"], typer.Option(help="Velocity estimator in the loop.")
     ] = "learned",
     estimator_file: Annotated[
-        Path,
+        Path | None,
         typer.Option(
             metavar="<file>", help="ONNX file of the learned estimator.", show_default="the shipped one"
         ),
-    ] = SHIPPED_MODEL,
+    ] = None,
     terrain: Annotated[Literal["flat", "rough", "slope"], typer.Option(help="Terrain.")] = "flat",
     actuator: Annotated[
         Path | None,
@@ -63,18 +71,20 @@ def eval_command(
     cluster: ClusterOption = None,
 ) -> None:
     """Measure how well a policy tracks velocities, in many walks in parallel."""
+    chosen = load_robot(robot)
     setup = Setup(
-        policy=policy,
+        robot=robot,
+        policy=policy or shipped_policy(chosen),
         estimator=estimator,
-        estimator_file=estimator_file,
+        estimator_file=estimator_file or shipped_estimator(chosen),
         terrain=terrain,
         randomised=randomised,
         actuator=actuator,
     )
-    PolicyFile(ALIENGO, policy)  # fail on a bad file here, once, before any run
-    LearnedEstimator(ALIENGO, estimator_file)
+    PolicyFile(chosen, setup.policy)  # fail on a bad file here, once, before any run
+    LearnedEstimator(chosen, setup.estimator_file)
     if actuator is not None:
-        ActuatorParameters.load(ALIENGO, actuator)
+        ActuatorParameters.load(chosen, actuator)
     folder = output_folder(out)
     with walk_progress_bar() as bar:
         task = bar.add_task("walks", total=None)
@@ -115,6 +125,7 @@ def faults_command(
             show_default="all of them",
         ),
     ] = None,
+    robot: RobotOption = DEFAULT_ROBOT,
 ) -> None:
     """Inject faults into a simulated robot, and measure its reaction and reaction time.
 
@@ -123,7 +134,7 @@ def faults_command(
     folder = output_folder(out)
     with walk_progress_bar() as bar:
         task = bar.add_task("walks", total=None)
-        runs = run_campaign(seeds, only, lambda done, of: bar.update(task, completed=done, total=of))
+        runs = run_campaign(robot, seeds, only, lambda done, of: bar.update(task, completed=done, total=of))
     cases = write_campaign(folder, runs)["cases"]
     console = Console()
     bad = any(case["as_expected"] < case["runs"] for case in cases)

@@ -17,10 +17,10 @@ from rich.table import Table
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.arrays import Array
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot, robot_of_file
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
-from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
+from quadvel_estimator.learned import LearnedEstimator
 from quadvel_estimator.tracker import Estimator, VelocityTracker
 from quadvel_nodes.messages import MessageError, read_low_state
 from quadvel_nodes.number_text import number_text
@@ -89,10 +89,13 @@ def compare_torques(joints: JointRecord, actuator: ActuatorParameters) -> Torque
     return TorqueComparison(joints.time[rows], joints.tau[rows], modelled[rows])
 
 
-def run_estimator(path: Path, estimator: Estimator, use_receipt_times: bool = False) -> tuple[Array, Array]:
+def run_estimator(
+    robot: Robot, path: Path, estimator: Estimator, use_receipt_times: bool = False
+) -> tuple[Array, Array]:
     """Run a velocity estimator on recorded states and commands; unusable states are skipped.
 
     Args:
+        robot: The robot.
         path: The recording.
         estimator: The estimator.
         use_receipt_times: Whether to use times of receipt instead of stamps.
@@ -108,7 +111,7 @@ def run_estimator(path: Path, estimator: Estimator, use_receipt_times: bool = Fa
     topics = ("/low_state", "/low_cmd")
     for topic, receipt, message in read_messages(path, lambda topic, _: topic in topics, lambda _: None):
         if topic == "/low_cmd":
-            tracker.set_previous_action(previous_action(ALIENGO, np.asarray(message.q, float), message.mode))
+            tracker.set_previous_action(previous_action(robot, np.asarray(message.q, float), message.mode))
             continue
         try:
             state = read_low_state(message)
@@ -213,17 +216,25 @@ def replay_command(
     ] = None,
     estimator: Annotated[Literal["learned", "kalman"], typer.Option(help="Velocity estimator.")] = "learned",
     estimator_file: Annotated[
-        Path,
+        Path | None,
         typer.Option(
             metavar="<file>", help="ONNX file of the learned estimator.", show_default="the shipped one"
         ),
-    ] = SHIPPED_MODEL,
+    ] = None,
     gains: Annotated[
         tuple[float, float] | None,
         typer.Option(
             metavar="<kp kd>",
             help="Commanded gains, N m/rad and N m s/rad, if the recording holds none.",
             show_default="none",
+        ),
+    ] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            metavar="<name|file>",
+            help="The robot: aliengo, go2 or a robot.yaml.",
+            show_default="as recorded",
         ),
     ] = None,
     state_topic: StateTopicOption = None,
@@ -238,10 +249,11 @@ def replay_command(
       quadvel replay walk.mcap --actuator out/identify/actuator.yaml
     To see a recording in 3-D: quadvel view walk.mcap
     """
-    model = ActuatorParameters.of(ALIENGO) if actuator is None else ActuatorParameters.load(ALIENGO, actuator)
-    asked = LearnedEstimator(ALIENGO, estimator_file) if estimator == "learned" else KalmanEstimator(ALIENGO)
     output_folder(out)
     run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording))
+    chosen = robot_of_file(recording, None if run.robot is None else run.robot.name, robot)
+    model = ActuatorParameters.of(chosen) if actuator is None else ActuatorParameters.load(chosen, actuator)
+    asked = LearnedEstimator(chosen, estimator_file) if estimator == "learned" else KalmanEstimator(chosen)
     if run.foreign_log is None:
         joints = read_joints(recording, MAX_STATE_PERIOD_S, run.uses_receipt_times)
     else:
@@ -249,7 +261,7 @@ def replay_command(
     comparison = compare_torques(joints, model)
     pictures, errors = {"torque": torque_figure(run, comparison)}, dict[str, Array]()
     if run.foreign_log is None:
-        times, found = run_estimator(recording, asked, run.uses_receipt_times)
+        times, found = run_estimator(chosen, recording, asked, run.uses_receipt_times)
         errors |= velocity_errors(run, times, found)
         pictures["velocity"] = velocity_figure(run, times, found)
     _print_results(comparison, errors)

@@ -20,10 +20,11 @@ from matplotlib.patches import Patch
 
 from quadvel_description.arrays import Array
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import TORQUE_LIMIT
+from quadvel_description.robot import Robot, robot_of_file
+from quadvel_description.robot_name import described_robot
 from quadvel_recordings.joint_log import JointLog, read_joint_log
 from quadvel_recordings.output import atomic_write, output_folder
-from quadvel_recordings.reading import RecordingError, read_messages
+from quadvel_recordings.reading import RecordingError, read_messages, recorded_description
 from quadvel_recordings.stamps import missing_stamp_notices, stamp_of
 
 from .demo_figures import AXIS_LABELS
@@ -83,6 +84,7 @@ class RecordedRun:
         joints: Joints whose angles, then torques, are the values of low_state.
         uses_receipt_times: Whether times of receipt replace missing stamps.
         foreign_log: Joint log of another robot, if the joints come from one.
+        robot: The robot that the recording names.
     """
 
     begin: float
@@ -92,6 +94,7 @@ class RecordedRun:
     joints: Sequence[str] = JOINT_NAMES
     uses_receipt_times: bool = False
     foreign_log: JointLog | None = None
+    robot: Robot | None = None
 
 
 @attrs.define
@@ -152,8 +155,10 @@ def read_recorded_run(
     changes = [k for k, mode in enumerate(loop.modes) if not k or loop.modes[k - 1] != mode]
     modes = [(float(loop.clock(received)[k]) - begin, loop.modes[k]) for k in changes]
     ends = max(float(times[-1]) for times, _ in lines.values())
-    joints = foreign.state.joints if foreign else JOINT_NAMES
-    return RecordedRun(begin, lines, modes, ends, joints, received, foreign)
+    if foreign:
+        return RecordedRun(begin, lines, modes, ends, foreign.state.joints, received, foreign)
+    robot = robot_of_file(path, described_robot(recorded_description(path)), None)
+    return RecordedRun(begin, lines, modes, ends, JOINT_NAMES, received, None, robot)
 
 
 def _read_topics(path: Path, warn: Callable[[str], None] | None) -> dict[str, _Topic]:
@@ -251,7 +256,7 @@ def joints_figure(run: RecordedRun) -> Figure | None:
 
 
 def torques_figure(run: RecordedRun) -> Figure | None:
-    """Plot the torque of each joint, with limits for this stack's robot.
+    """Plot the torque of each joint, with the limits of a robot of this stack.
 
     Args:
         run: The run.
@@ -265,9 +270,10 @@ def torques_figure(run: RecordedRun) -> Figure | None:
     figure, panels = joint_panels(run)
     for joint, (name, panel) in enumerate(zip(run.joints, panels.ravel(), strict=False)):
         panel.plot(time, numbers[:, len(run.joints) + joint], color="tab:blue", lw=0.6, label="measured")
-        if run.foreign_log is None:
-            panel.axhline(TORQUE_LIMIT[joint], color="tab:red", lw=0.8, ls="--", label="limit")
-            panel.axhline(-TORQUE_LIMIT[joint], color="tab:red", lw=0.8, ls="--")
+        if run.robot is not None:
+            limit = run.robot.torque_limit[joint]
+            panel.axhline(limit, color="tab:red", lw=0.8, ls="--", label="limit")
+            panel.axhline(-limit, color="tab:red", lw=0.8, ls="--")
         panel.set_title(f"{name.removesuffix('_joint')}, N m", fontsize="small", loc="left")
     add_legend(figure, run, panels[0, 0])
     return figure

@@ -18,7 +18,7 @@ from scipy.signal import savgol_filter
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand
 from quadvel_nodes.messages import seconds
 from quadvel_policy.policy_file import PolicyFile
@@ -31,7 +31,6 @@ from quadvel_sim.simulator import DT, Simulator, Truth
 from .recording import Recording
 from .robot_loop import CONTROL_PERIOD_S, RobotLoop, make_estimator
 from .segments import SETTLING_TIME_S, Segment, measure_segment
-from .walk import Setup
 
 STRETCH_DURATION_S = 0.2  # of one open-loop replay
 STRETCH_INTERVAL_S = 0.35  # between stretches; not a multiple of the gait period
@@ -270,6 +269,7 @@ def torque_error(actuator: ActuatorParameters, joints: JointRecord, start: float
 
 
 def open_loop_error(
+    robot: Robot,
     actuator: ActuatorParameters,
     joints: JointRecord,
     truth: Callable[[float], Truth],
@@ -281,6 +281,7 @@ def open_loop_error(
     Each stretch starts from the recorded state.
 
     Args:
+        robot: The robot.
         actuator: Parameters of the robot's drives.
         joints: The recorded joints.
         truth: Function from a time (s) to the recorded state of the trunk.
@@ -294,7 +295,7 @@ def open_loop_error(
         ValueError: The interval holds no complete stretch.
     """
     quiet = attrs.evolve(actuator, torque_noise=0.0)
-    simulator = Simulator(SimulatorConfig(robot=ALIENGO, actuator=quiet, noise=SensorNoise.none()))
+    simulator = Simulator(SimulatorConfig(robot=robot, actuator=quiet, noise=SensorNoise.none()))
     errors = [
         _stretch_errors(simulator, joints, truth, row)
         for row in np.searchsorted(
@@ -362,11 +363,12 @@ def recorded_truth(recording: Recording) -> Callable[[float], Truth]:
 
 
 def predicted_tracking(
-    actuator: ActuatorParameters, commands: Sequence[tuple[Array, float]], seed: int
+    robot: Robot, actuator: ActuatorParameters, commands: Sequence[tuple[Array, float]], seed: int
 ) -> list[Segment]:
     """Simulate the shipped policy on a robot with an actuator model.
 
     Args:
+        robot: The robot.
         actuator: Parameters of the robot's drives.
         commands: Velocity (3,) and duration (s) of each command.
         seed: Seed of the simulator.
@@ -374,11 +376,10 @@ def predicted_tracking(
     Returns:
         Command and mean velocity of each command.
     """
-    setup = Setup()
-    simulator = Simulator(SimulatorConfig(robot=ALIENGO, actuator=actuator, seed=seed))
+    simulator = Simulator(SimulatorConfig(robot=robot, actuator=actuator, seed=seed))
     simulator.reset("stand")
-    supervisor = Supervisor(ALIENGO, PolicyFile(ALIENGO))
-    loop = RobotLoop(simulator, supervisor, make_estimator(setup.estimator, simulator, setup.estimator_file))
+    supervisor = Supervisor(robot, PolicyFile(robot))
+    loop = RobotLoop(simulator, supervisor, make_estimator("learned", simulator, None))
     loop.start_walking()
     segments = []
     for command, duration in commands:

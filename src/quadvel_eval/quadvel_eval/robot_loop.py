@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadvel_description.arrays import Array
-from quadvel_description.robot import ALIENGO
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
@@ -58,7 +57,7 @@ class TrueVelocity:
         return self._simulator.truth().linear_velocity, np.zeros((3, 3))
 
 
-def make_estimator(kind: str, simulator: Simulator, file: Path) -> Estimator:
+def make_estimator(kind: str, simulator: Simulator, file: Path | None) -> Estimator:
     """Create a velocity estimator.
 
     Args:
@@ -73,9 +72,9 @@ def make_estimator(kind: str, simulator: Simulator, file: Path) -> Estimator:
         ValueError: The kind is unknown.
     """
     if kind == "learned":
-        return LearnedEstimator(ALIENGO, file)
+        return LearnedEstimator(simulator.config.robot, file)
     if kind == "kalman":
-        return KalmanEstimator(ALIENGO)
+        return KalmanEstimator(simulator.config.robot)
     if kind == "truth":
         return TrueVelocity(simulator)
     raise ValueError(f"estimator is '{kind}', expected one of {', '.join(ESTIMATORS)}")
@@ -154,7 +153,7 @@ class RobotLoop:
         commanded = [*mux_output.velocity, mux_output.stance]
         command = self.supervisor.tick(TickInput(now, state, self._velocity, commanded))
         self._velocity, _ = self._estimator.update(state, self._previous_action)
-        self._previous_action = previous_action(ALIENGO, command.q, command.mode)
+        self._previous_action = previous_action(simulator.config.robot, command.q, command.mode)
         simulator.command(command)
         simulator.step(SIMULATOR_STEPS_PER_TICK)
         return Sample(

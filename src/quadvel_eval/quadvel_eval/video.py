@@ -16,8 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description.arrays import Array
 from quadvel_description.mjcf import load_model
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot, robot_of_file
+from quadvel_description.robot_name import described_robot
 from quadvel_recordings.output import atomic_write
+from quadvel_recordings.reading import recorded_description
 
 from .demo_figures import tracking_figure
 from .demo_summary import constant_commands
@@ -36,14 +38,15 @@ class Film:
     """Renders the robot of a recording, with a camera that follows it.
 
     Args:
+        robot: The robot.
         recording: The recording.
         width: Width of a frame, pixels.
         height: Height of a frame, pixels.
     """
 
-    def __init__(self, recording: Recording, width: int, height: int) -> None:
+    def __init__(self, robot: Robot, recording: Recording, width: int, height: int) -> None:
         self._recording = recording
-        self._model = load_model(ALIENGO)
+        self._model = load_model(robot)
         self._data = mujoco.MjData(self._model)
         self._renderer = mujoco.Renderer(self._model, height, width)
         self._camera = mujoco.MjvCamera()
@@ -80,10 +83,11 @@ class Film:
             yield self._renderer.render().copy()
 
 
-def frame_strip(recording: Recording) -> list[tuple[str, Image]]:
+def frame_strip(robot: Robot, recording: Recording) -> list[tuple[str, Image]]:
     """Render frames from the middle of some segments with motion.
 
     Args:
+        robot: The robot.
         recording: The recording.
 
     Returns:
@@ -91,7 +95,7 @@ def frame_strip(recording: Recording) -> list[tuple[str, Image]]:
     """
     moving = [c for c in constant_commands(recording.planned.time, recording.planned.value) if c[2].any()]
     picked = [moving[i] for i in np.unique(np.linspace(0, len(moving) - 1, STRIP_FRAMES).round().astype(int))]
-    with Film(recording, *STRIP_SIZE) as film:
+    with Film(robot, recording, *STRIP_SIZE) as film:
         images = list(film.frames([0.5 * (start + end) for start, end, _ in picked]))
     return [(_caption(velocity), image) for (_, _, velocity), image in zip(picked, images, strict=True)]
 
@@ -101,17 +105,18 @@ def _caption(velocity: Array) -> str:
     return ", ".join(f"{axis} {x:g}" for axis, x in zip(("vx", "vy", "wz"), velocity, strict=True) if x)
 
 
-def write_video(path: Path, recording: Recording) -> None:
+def write_video(robot: Robot, path: Path, recording: Recording) -> None:
     """Write the whole recording as an MP4 in real time.
 
     Args:
+        robot: The robot.
         path: The file.
         recording: The recording.
     """
     from imageio_ffmpeg import write_frames
 
     start, end = recording.position.time[[0, -1]]
-    with atomic_write(path) as draft, Film(recording, *VIDEO_SIZE) as film:
+    with atomic_write(path) as draft, Film(robot, recording, *VIDEO_SIZE) as film:
         video = write_frames(str(draft), VIDEO_SIZE, fps=FRAMES_PER_SECOND, quality=7, macro_block_size=8)
         video.send(None)  # starts the encoder
         for frame in film.frames(np.arange(start, end, 1.0 / FRAMES_PER_SECOND)):
@@ -125,9 +130,11 @@ def main(arguments: Sequence[str]) -> None:
     Args:
         arguments: Recording and folder.
     """
-    recording, folder = read_recording(Path(arguments[0])), Path(arguments[1])
-    write_figure(folder / "demo.png", tracking_figure(recording, frame_strip(recording)))
-    write_video(folder / "demo.mp4", recording)
+    path, folder = Path(arguments[0]), Path(arguments[1])
+    recording = read_recording(path)
+    robot = robot_of_file(path, described_robot(recorded_description(path)), None)
+    write_figure(folder / "demo.png", tracking_figure(recording, frame_strip(robot, recording)))
+    write_video(robot, folder / "demo.mp4", recording)
 
 
 if __name__ == "__main__":

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadvel_actuator import ActuatorParameters
-from quadvel_description import robot
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.fields import field
 from quadvel_description.kinematics import rotate, yaw
 from quadvel_description.quadruped import GRAVITY
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot, load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_estimator.kalman import KalmanEstimator
-from quadvel_estimator.learned import SHIPPED_MODEL
-from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from quadvel_estimator.learned import shipped_estimator
+from quadvel_policy.policy_file import PolicyFile, shipped_policy
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.terrain import Terrain
@@ -40,18 +40,24 @@ class Setup:
     """Robot, policy and ground of a walk.
 
     Attributes:
-        policy: ONNX file of the policy.
+        robot: Name of a shipped robot, or path of a robot.yaml.
+        policy: ONNX file of the policy; the default is the shipped one of the robot.
         estimator: Velocity estimator in the loop, one of `robot_loop.ESTIMATORS`.
-        estimator_file: ONNX file of the learned estimator.
+        estimator_file: ONNX file of the learned estimator; the default is the shipped one of the robot.
         terrain: One of TERRAINS.
         randomised: Whether the seed draws plant and actuators.
-        actuator: File of the robot's actuator model; None for the shipped model.
+        actuator: File of an actuator model; None for the robot's.
         plant: Fields of `SimulatorConfig` that override all other settings and draws.
     """
 
-    policy: Path = SHIPPED_POLICY
+    robot: str = DEFAULT_ROBOT
+    policy: Path = attrs.field(
+        default=attrs.Factory(lambda setup: shipped_policy(load_robot(setup.robot)), takes_self=True)
+    )
     estimator: str = "learned"
-    estimator_file: Path = SHIPPED_MODEL
+    estimator_file: Path = attrs.field(
+        default=attrs.Factory(lambda setup: shipped_estimator(load_robot(setup.robot)), takes_self=True)
+    )
     terrain: str = field("flat", one_of=TERRAINS)
     randomised: bool = False
     actuator: Path | None = None
@@ -80,12 +86,12 @@ def make_simulator(setup: Setup, seed: int) -> Simulator:
     terrain = Terrain(
         kind=setup.terrain, slope=SLOPE_ANGLE_RAD if setup.terrain == "slope" else 0.0, seed=seed
     )
-    rng = np.random.default_rng(seed)
-    drawn = _draw_plant(rng) if setup.randomised else {}
+    robot, rng = load_robot(setup.robot), np.random.default_rng(seed)
+    drawn = _draw_plant(robot, rng) if setup.randomised else {}
     if setup.actuator is not None:
-        drawn["actuator"] = ActuatorParameters.load(ALIENGO, setup.actuator)
+        drawn["actuator"] = ActuatorParameters.load(robot, setup.actuator)
     simulator = Simulator(
-        SimulatorConfig(**{"robot": ALIENGO, "terrain": terrain, "seed": seed, **drawn, **setup.plant})
+        SimulatorConfig(**{"robot": robot, "terrain": terrain, "seed": seed, **drawn, **setup.plant})
     )
     simulator.reset("stand")
     if setup.randomised:
@@ -94,15 +100,15 @@ def make_simulator(setup: Setup, seed: int) -> Simulator:
     return simulator
 
 
-def _draw_plant(rng: np.random.Generator) -> dict[str, Any]:
+def _draw_plant(robot: Robot, rng: np.random.Generator) -> dict[str, Any]:
     """Draw friction, payload and joint properties as fields of `SimulatorConfig`."""
     return {
         "friction": rng.uniform(0.3, 1.0, 4),
         "payload": rng.uniform(0.0, 3.0),
         "payload_position": rng.uniform([-0.1, -0.05, 0.05], [0.1, 0.05, 0.15]),
-        "armature": robot.ARMATURE * rng.uniform(0.8, 1.2),
-        "joint_friction": robot.FRICTION * rng.uniform(0.2, 1.5),
-        "joint_damping": robot.DAMPING * rng.uniform(0.2, 1.5),
+        "armature": robot.armature * rng.uniform(0.8, 1.2),
+        "joint_friction": robot.joint_friction * rng.uniform(0.2, 1.5),
+        "joint_damping": robot.joint_damping * rng.uniform(0.2, 1.5),
     }
 
 
@@ -118,9 +124,10 @@ def make_loop(setup: Setup, seed: int, shadow_estimators: Sequence[str] = ("lear
         A loop whose supervisor is in mode walk.
     """
     simulator = make_simulator(setup, seed)
+    robot = simulator.config.robot
     loop = RobotLoop(
         simulator,
-        Supervisor(ALIENGO, PolicyFile(ALIENGO, setup.policy), backup=KalmanEstimator(ALIENGO)),
+        Supervisor(robot, PolicyFile(robot, setup.policy), backup=KalmanEstimator(robot)),
         make_estimator(setup.estimator, simulator, setup.estimator_file),
         shadow_estimators={
             name: make_estimator(name, simulator, setup.estimator_file) for name in shadow_estimators

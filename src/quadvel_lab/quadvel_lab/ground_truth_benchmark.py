@@ -24,7 +24,8 @@ from rich.table import Table
 from quadvel_actuator import ActuatorParameters
 from quadvel_bringup.processes import ProcessGroup, StopSignals
 from quadvel_bringup.stack import Stack
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot, load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_eval import demo_summary, replay
 from quadvel_eval.pool import Call, run_in_parallel
 from quadvel_eval.recording import Recording, read_recording
@@ -215,14 +216,15 @@ def evaluate_models(folders: Mapping[str, Path], console: Console) -> list[dict[
     Returns:
         The entries of `twin.json`.
     """
-    own = ActuatorParameters.of(ALIENGO)
+    robot = load_robot(DEFAULT_ROBOT)
+    own = ActuatorParameters.of(robot)
     drives = [step for step in SCRIPTS[SCRIPT] if isinstance(step, Drive) and any(step.velocity)]
     commands = [(np.array(step.velocity), step.duration) for step in drives]
-    calls: list[Call] = [(replay.predicted_tracking, own, commands, seed) for seed in MODEL_SEEDS]
+    calls: list[Call] = [(replay.predicted_tracking, robot, own, commands, seed) for seed in MODEL_SEEDS]
     for folder in folders.values():
-        corrected = ActuatorParameters.load(ALIENGO, folder / "identify" / "actuator.yaml")
-        calls += [(replay.predicted_tracking, corrected, commands, seed) for seed in MODEL_SEEDS]
-        calls += [(_replay_errors, model, folder / f"{WALKS[1]}.mcap") for model in (own, corrected)]
+        corrected = ActuatorParameters.load(robot, folder / "identify" / "actuator.yaml")
+        calls += [(replay.predicted_tracking, robot, corrected, commands, seed) for seed in MODEL_SEEDS]
+        calls += [(_replay_errors, robot, model, folder / f"{WALKS[1]}.mcap") for model in (own, corrected)]
     answers = iter(_answers(calls, console))
     before = _average([next(answers) for _ in MODEL_SEEDS])
     return [_entry(name, folder, before, answers) for name, folder in folders.items()]
@@ -260,13 +262,15 @@ def _entry(name: str, folder: Path, before: Sequence[Segment], answers: Iterator
     return entry
 
 
-def _replay_errors(model: ActuatorParameters, recording: Path) -> tuple[float, replay.ReplayError]:
+def _replay_errors(
+    robot: Robot, model: ActuatorParameters, recording: Path
+) -> tuple[float, replay.ReplayError]:
     """Return the torque error (N^2 m^2) and the open-loop error of a model on a recorded walk."""
     walk = read_walk(recording)
     begin, end = walk.stretches[0][0], walk.stretches[-1][1]
     torque = replay.torque_error(model, walk.joints, begin, end)
     return torque, replay.open_loop_error(
-        model, walk.joints, replay.recorded_truth(walk.recording), begin, end
+        robot, model, walk.joints, replay.recorded_truth(walk.recording), begin, end
     )
 
 

@@ -23,7 +23,8 @@ quadvel_dds.install()  # before anything imports rclpy
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.node import run
 from quadvel_nodes.scheduling import Scheduling
@@ -39,7 +40,7 @@ class Floor(Node):
 
     def __init__(self) -> None:
         super().__init__("floor")
-        self._policy = PolicyFile(ALIENGO)
+        self._policy = PolicyFile(load_robot(DEFAULT_ROBOT))
         self._observation = np.zeros(self._policy.metadata.observation.size, np.float32)
         self._answers = self.create_publisher(LowCmd, "floor/low_cmd", 1)
         self.create_subscription(LowState, "low_state", self._on_state, qos_profile_sensor_data)

@@ -18,7 +18,6 @@ import numpy as np
 from typing_extensions import override
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
-from quadvel_description import robot
 from quadvel_description.arrays import Array
 from quadvel_description.bounded_yaml import read_yaml
 from quadvel_description.fields import field
@@ -146,13 +145,21 @@ class HiddenDrives(ActuatorModel):
     Args:
         parameters: The stack's actuator parameters.
         physics: The hidden effect.
+        torque_limit: Torque limit of the drives, (12,), N m.
         dt: Time step, s.
         seed: Seed of the noise.
     """
 
-    def __init__(self, parameters: ActuatorParameters, physics: HiddenPhysics, dt: float, seed: int) -> None:
+    def __init__(
+        self,
+        parameters: ActuatorParameters,
+        physics: HiddenPhysics,
+        torque_limit: Array,
+        dt: float,
+        seed: int,
+    ) -> None:
         super().__init__(attrs.evolve(parameters, torque_noise=0.0), dt=dt, seed=seed)
-        self._physics = physics
+        self._physics, self._torque_limit = physics, torque_limit
         self._deviation = np.sqrt(parameters.torque_noise)
         self._draws = np.random.default_rng(seed)
         self._next_draw = self._draws.standard_normal(12)
@@ -194,7 +201,7 @@ class HiddenDrives(ActuatorModel):
         """Return the torque of one step with the present noise."""
         asked = super().step(q, dq, *arguments, **named)
         torque = self._physics.torque(asked, q, dq, self.dt) + self._deviation * self._next_draw
-        return np.clip(torque, -robot.TORQUE_LIMIT, robot.TORQUE_LIMIT)
+        return np.clip(torque, -self._torque_limit, self._torque_limit)
 
 
 class Plant(Simulator):
@@ -239,7 +246,9 @@ class Plant(Simulator):
 
     def _make_actuator(self, seed: int) -> ActuatorModel:
         """Make the hidden drives."""
-        return HiddenDrives(self.config.actuator, self._make_physics(), DT, seed)
+        return HiddenDrives(
+            self.config.actuator, self._make_physics(), self.config.robot.torque_limit, DT, seed
+        )
 
 
 def read_plant(path: Path) -> Callable[[], HiddenPhysics]:

@@ -31,7 +31,8 @@ from rclpy.qos import QoSProfile
 from quadvel_bringup.processes import ProcessGroup
 from quadvel_bringup.session import Session
 from quadvel_bringup.stack import Stack
-from quadvel_description.robot import TORQUE_LIMIT, UPPER
+from quadvel_description.robot import Robot, load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand
 from quadvel_msgs.srv import ResetSim, SetMode
 from quadvel_policy.command_limits import LIMITS
@@ -86,6 +87,7 @@ class Relay:
     """Receives the topics of RELAYED_TYPES and forwards them, modified during a fault.
 
     Args:
+        robot: The robot.
         node: The node that it uses.
 
     Attributes:
@@ -96,8 +98,8 @@ class Relay:
         limits: Counts of each command limit in /diagnostics.
     """
 
-    def __init__(self, node: Any) -> None:
-        self.node = node
+    def __init__(self, robot: Robot, node: Any) -> None:
+        self.robot, self.node = robot, node
         self.velocity = 0.0
         self.states: list[Message] = []
         self.last_command: Message | None = None
@@ -180,7 +182,7 @@ class TopicRobot:
     def __enter__(self) -> TopicRobot:
         """Start the processes and wait for the controller."""
         self._session.__enter__()
-        self.relay = Relay(self._session.node)
+        self.relay = Relay(load_robot(self._stack.robot or DEFAULT_ROBOT), self._session.node)
         for name, words in self._stack.commands().items():
             topics = [topic for topic, senders in SENDERS.items() if name in senders]
             renamed = [word for topic in topics for word in ("-r", f"{topic}:=before/{topic}")]
@@ -364,6 +366,11 @@ def _at(joint: int, value: float) -> Callable[[Any], Any]:
     return lambda before: np.where(np.arange(12) == joint, value, before)
 
 
+def _out_of_range(relay: Relay, message: Message) -> Message:
+    """Move one joint beyond its mechanical range."""
+    return _set(q=_at(FAULTY_JOINT, float(relay.robot.upper[FAULTY_JOINT]) + 0.5))(relay, message)
+
+
 def _plus(joint: int, value: float) -> Callable[[Any], Any]:
     """Return a function that adds to the value of one joint."""
     return lambda before: before + value * (np.arange(12) == joint)
@@ -449,7 +456,7 @@ def _prescribed_motion(joints: Sequence[int], path: Path) -> Change:
         if (command := relay.last_command) is not None:
             asked = np.array(command.tau) + np.array(command.kp) * (np.array(command.q) - q)
             asked += np.array(command.kd) * (np.array(command.dq) - dq)
-            tau = np.where(there, np.clip(asked, -TORQUE_LIMIT, TORQUE_LIMIT), tau)
+            tau = np.where(there, np.clip(asked, -relay.robot.torque_limit, relay.robot.torque_limit), tau)
         message.q, message.dq, message.tau = (np.asarray(v, np.float32) for v in (q, dq, tau))
         return message
 
@@ -518,7 +525,7 @@ FAULTS = (
     TopicFault("controller_stopped", begin=lambda robot: robot.suspend("controller", 2.0)),
     TopicFault("state_frozen", change=_keep_first, begin=_repeat),
     TopicFault("tilted", change=_set(orientation_wxyz=TILTED)),
-    TopicFault("joint_out_of_range", change=_set(q=_at(FAULTY_JOINT, float(UPPER[FAULTY_JOINT]) + 0.5))),
+    TopicFault("joint_out_of_range", change=_out_of_range),
     TopicFault("joint_too_fast", change=_set(dq=_at(FAULTY_JOINT, 50.0))),
     TopicFault("encoder_inconsistent", change=_set(q=_plus(FAULTY_JOINT, 0.4))),
     TopicFault("encoder_frozen", change=_stuck("q", "dq", joint=2), mode="stand_up"),

@@ -10,7 +10,7 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Array
-from quadvel_description.robot import ALIENGO, LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
+from quadvel_description.robot import Robot, load_robot
 from quadvel_description.state import MODE_DAMPING
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
@@ -75,11 +75,15 @@ class FaultRun:
 
 
 def run_campaign(
-    seeds: int, only: str | None = None, progress: Callable[[int, int], None] = lambda done, of: None
+    robot: str,
+    seeds: int,
+    only: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[FaultRun]:
     """Run every component and kind of fault from seeds 0, 1, ..., which alternate between its modes.
 
     Args:
+        robot: Name of a shipped robot, or path of a robot.yaml.
         seeds: Number of seeds of each component and kind.
         only: Run only cases whose "component kind mode" contains this text.
         progress: Called with the number of finished runs and the number of all runs.
@@ -101,7 +105,7 @@ def run_campaign(
     for case in cases:
         kinds.setdefault((case.component, case.kind), []).append(case)
     calls: list[Call] = [
-        (run_case, modes[seed % len(modes)], seed) for modes in kinds.values() for seed in range(seeds)
+        (run_case, robot, modes[seed % len(modes)], seed) for modes in kinds.values() for seed in range(seeds)
     ]
     runs: list[FaultRun | None] = [None] * len(calls)
     for done, (i, answer) in enumerate(run_in_parallel(calls), 1):
@@ -111,15 +115,16 @@ def run_campaign(
 
 
 @cache
-def _networks() -> tuple[PolicyFile, LearnedEstimator]:
+def _networks(robot: Robot) -> tuple[PolicyFile, LearnedEstimator]:
     """Load the shipped networks once per process."""
-    return PolicyFile(ALIENGO), LearnedEstimator(ALIENGO)
+    return PolicyFile(robot), LearnedEstimator(robot)
 
 
-def run_case(case: Case, seed: int) -> FaultRun:
+def run_case(robot: str, case: Case, seed: int) -> FaultRun:
     """Simulate one fault.
 
     Args:
+        robot: Name of a shipped robot, or path of a robot.yaml.
         case: Fault and oracle.
         seed: Seed of simulator, instant and fault.
 
@@ -127,7 +132,7 @@ def run_case(case: Case, seed: int) -> FaultRun:
         The outcome.
     """
     rng = np.random.default_rng([seed, *map(ord, case.name)])
-    stack = _prepare_stack(case.mode, rng, seed)
+    stack = _prepare_stack(load_robot(robot), case.mode, rng, seed)
     result = FaultRun(case.component, case.kind, case.mode, seed)
     healthy = [*stack.supervisor.findings]
     if healthy or stack.supervisor.fault:
@@ -146,11 +151,11 @@ def run_case(case: Case, seed: int) -> FaultRun:
     return result
 
 
-def _prepare_stack(mode: str, rng: np.random.Generator, seed: int) -> Stack:
+def _prepare_stack(robot: Robot, mode: str, rng: np.random.Generator, seed: int) -> Stack:
     """Bring a robot to a random instant of a mode."""
-    simulator = Simulator(SimulatorConfig(robot=ALIENGO, seed=seed))
+    simulator = Simulator(SimulatorConfig(robot=robot, seed=seed))
     simulator.reset("lie" if mode == "stand_up" else "stand")
-    policy, estimator = _networks()
+    policy, estimator = _networks(robot)
     policy.reset()
     estimator.reset()
     stack = Stack(simulator, policy, estimator)
@@ -196,15 +201,15 @@ def _observe(stack: Stack, case: Case, time: float, result: FaultRun, too_fast: 
     Returns:
         The same times after this step (12,), s.
     """
-    data, supervisor = stack.simulator.data, stack.supervisor
-    result.torque = max(result.torque, float((np.abs(data.ctrl) / TORQUE_LIMIT).max()))
+    robot, data, supervisor = stack.simulator.config.robot, stack.simulator.data, stack.supervisor
+    result.torque = max(result.torque, float((np.abs(data.ctrl) / robot.torque_limit).max()))
     # A drive accelerates its joint if torque and speed have the same sign.
     q, dq = data.qpos[7:], data.qvel[6:]
-    driven = np.where(data.ctrl * dq > 0.0, np.abs(dq) / VELOCITY_LIMIT, 0.0)
+    driven = np.where(data.ctrl * dq > 0.0, np.abs(dq) / robot.velocity_limit, 0.0)
     result.speed = max(result.speed, float(driven.max()))
     too_fast = np.where(driven > MAX_SPEED_RATIO, too_fast + DT, 0.0)
     result.too_fast = max(result.too_fast, float(too_fast.max()))
-    result.beyond = max(result.beyond, float(np.maximum(LOWER - q, q - UPPER).max()))
+    result.beyond = max(result.beyond, float(np.maximum(robot.lower - q, q - robot.upper).max()))
     for name in [supervisor.fault, *(finding.name for finding in supervisor.findings)]:
         if name and name not in result.findings:
             result.findings.append(name)

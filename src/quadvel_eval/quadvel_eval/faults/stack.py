@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from quadvel_description.arrays import Array
-from quadvel_description.robot import ALIENGO
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_driver.link import MAX_COMMAND_AGE_MS, clamp_for_board
 from quadvel_estimator.features import previous_action
@@ -153,8 +152,8 @@ class Stack:
         self.planned_velocity = np.zeros(3)
         self.sensor_fault: Callable[[int, RobotState], RobotState] | None = None
         self.processes = {name: Process() for name in ("controller", "estimator", "mux", "planner")}
-        config = ControlConfig()
-        self.supervisor = Supervisor(ALIENGO, policy, config.supervisor, KalmanEstimator(ALIENGO), guards)
+        config, robot = ControlConfig(), simulator.config.robot
+        self.supervisor = Supervisor(robot, policy, config.supervisor, KalmanEstimator(robot), guards)
         self._loop = ControlLoop(self.supervisor, config, self._answer, self._clock, steady=self._steady)
         self._tracker = VelocityTracker(estimator)
         self._mux = CommandMux([PLANNER])
@@ -240,7 +239,9 @@ class Stack:
     def _command_to_estimator(self, message: Message) -> None:
         """Estimator: take the joint command, its previous action."""
         self.processes["estimator"].submit(
-            lambda: self._tracker.set_previous_action(previous_action(ALIENGO, message.q, message.mode))
+            lambda: self._tracker.set_previous_action(
+                previous_action(self.simulator.config.robot, message.q, message.mode)
+            )
         )
 
     def _state_to_controller(self, message: Message) -> None:
@@ -289,7 +290,7 @@ class Stack:
             return
         if 0 <= self.now - command.tick <= MAX_COMMAND_AGE_MS:
             self.robot_command_mode = command.mode
-            self.simulator.command(clamp_for_board(command, ALIENGO))
+            self.simulator.command(clamp_for_board(command, self.simulator.config.robot))
 
 
 def corrupt(message: Message, rng: np.random.Generator) -> Message:

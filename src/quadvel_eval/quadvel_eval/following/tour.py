@@ -17,12 +17,12 @@ import numpy as np
 
 from quadvel_description.arrays import Array
 from quadvel_description.kinematics import rotate, yaw
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_estimator.kalman import KalmanEstimator
-from quadvel_estimator.learned import SHIPPED_MODEL
 from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, Plan, State
 from quadvel_follow.pose_history import PoseHistory
-from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.world import World
@@ -45,22 +45,24 @@ class TourSetup:
     """Setup of a tour.
 
     Attributes:
+        robot: Name of a shipped robot, or path of a robot.yaml.
         world: Name of a shipped world, or a YAML file.
         path_length: Path length after which the tour ends, m.
         seed: Seed of the simulator.
-        policy: ONNX file of the policy.
+        policy: ONNX file of the policy; None: the shipped one of the robot.
         estimator: Velocity estimator in the loop.
-        estimator_file: ONNX file of the learned estimator.
+        estimator_file: ONNX file of the learned estimator; None: the shipped one of the robot.
         distance: Set distance to the person, m.
         plant: Fields of `SimulatorConfig` that differ from the nominal robot.
     """
 
+    robot: str = DEFAULT_ROBOT
     world: str = "campus"
     path_length: float = 3100.0
     seed: int = 0
-    policy: Path = SHIPPED_POLICY
+    policy: Path | None = None
     estimator: str = "learned"
-    estimator_file: Path = SHIPPED_MODEL
+    estimator_file: Path | None = None
     distance: float = 1.5
     plant: dict[str, Any] = attrs.field(factory=dict)
 
@@ -110,11 +112,12 @@ class Tour:
 
     def __init__(self, setup: TourSetup) -> None:
         self.setup, self.world = setup, World.load(setup.world)
+        robot = load_robot(setup.robot)
         self.simulator = Simulator(
-            SimulatorConfig(robot=ALIENGO, world=self.world, seed=setup.seed, **setup.plant)
+            SimulatorConfig(robot=robot, world=self.world, seed=setup.seed, **setup.plant)
         )
         self.simulator.reset("stand")
-        supervisor = Supervisor(ALIENGO, PolicyFile(ALIENGO, setup.policy), backup=KalmanEstimator(ALIENGO))
+        supervisor = Supervisor(robot, PolicyFile(robot, setup.policy), backup=KalmanEstimator(robot))
         estimator = make_estimator(setup.estimator, self.simulator, setup.estimator_file)
         self._loop = RobotLoop(self.simulator, supervisor, estimator)
         laser = self.world.laser
@@ -219,6 +222,7 @@ class Outcome:
     """Outcome of a walk behind a person, without its samples.
 
     Attributes:
+        robot: Name of a shipped robot, or path of a robot.yaml.
         world: Name of the world.
         seed: Seed of the run.
         distance: Set distance to the person, m.

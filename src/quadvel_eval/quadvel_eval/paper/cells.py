@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import load_robot
 from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
 
@@ -129,7 +129,7 @@ def command_limits(study: Study, policy: str) -> VelocityCommandLimits:
     Returns:
         The limits.
     """
-    return PolicyFile(ALIENGO, study.policies[policy]).metadata.limits
+    return PolicyFile(load_robot(study.robot), study.policies[policy]).metadata.limits
 
 
 def is_within_limits(command: Command, bounds: VelocityCommandLimits) -> bool:

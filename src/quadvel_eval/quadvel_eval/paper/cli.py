@@ -8,12 +8,13 @@ from typing import Annotated, Literal
 import typer
 from rich.console import Console
 
-from quadvel_description.robot import ALIENGO
-from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
+from quadvel_estimator.learned import LearnedEstimator, shipped_estimator
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_recordings.output import output_folder
 
-from ..cli import ClusterOption, walk_progress_bar
+from ..cli import ClusterOption, RobotOption, walk_progress_bar
 from .files import PAGE_FILE
 from .section import Section, Study
 from .study import SECTIONS, Progress, run_sections
@@ -42,12 +43,13 @@ def paper_command(
     estimator: Annotated[
         Literal["learned", "kalman", "truth"], typer.Option(help="Velocity estimator in the loop.")
     ] = "learned",
+    robot: RobotOption = DEFAULT_ROBOT,
     estimator_file: Annotated[
-        Path,
+        Path | None,
         typer.Option(
             metavar="<file>", help="ONNX file of the learned estimator.", show_default="the shipped one"
         ),
-    ] = SHIPPED_MODEL,
+    ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each walk, with seeds 0, 1, ...")] = 3,
     again: Annotated[bool, typer.Option("--again", help="Run finished sections, too.")] = False,
     cluster: ClusterOption = None,
@@ -62,15 +64,17 @@ def paper_command(
       quadvel paper --out out/ablation --policy rl_pd=a.onnx --policy crl_eam=b.onnx --only tracking --only gap
     """
     policies = _policies(policy or [])
+    chosen = load_robot(robot)
     study = Study(
+        robot=robot,
         **({"policies": policies} if policies else {}),
         estimator=estimator,
-        estimator_file=estimator_file,
+        estimator_file=estimator_file or shipped_estimator(chosen),
         seeds=seeds,
     )
     for path in study.policies.values():
-        PolicyFile(ALIENGO, path)  # fail on a bad file here, once, before any run
-    LearnedEstimator(ALIENGO, estimator_file)
+        PolicyFile(chosen, path)  # fail on a bad file here, once, before any run
+    LearnedEstimator(chosen, study.estimator_file)
     sections = _sections(only or [])
     folder = output_folder(out)
     with walk_progress_bar() as bar:

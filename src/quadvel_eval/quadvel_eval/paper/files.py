@@ -16,7 +16,7 @@ from typing import Any
 import attrs
 from matplotlib.figure import Figure
 
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot, load_robot
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_recordings.output import atomic_write
 
@@ -80,7 +80,7 @@ def write_section(folder: Path, section: Section, study: Study, records: Sequenc
     kept = read_records(folder / f"{section.name}.csv")
     write_figure(folder / f"{section.name}.png", section.figure(kept) if kept else _empty_figure())
     rows = [attrs.asdict(row) for row in section.rows(kept)]
-    about = {name: _policy_info(path) for name, path in study.policies.items()}
+    about = {name: _policy_info(load_robot(study.robot), path) for name, path in study.policies.items()}
     content = {"made_with": provenance(section, study), "policies": about, "rows": rows}
     write_json(folder / f"{section.name}.json", {"schema": SCHEMA, **content})
 
@@ -92,9 +92,9 @@ def _empty_figure() -> Figure:
     return figure
 
 
-def _policy_info(path: Path) -> dict[str, Any]:
+def _policy_info(robot: Robot, path: Path) -> dict[str, Any]:
     """File name, command limits and recipe of a policy."""
-    metadata = PolicyFile(ALIENGO, path).metadata
+    metadata = PolicyFile(robot, path).metadata
     limits = {axis: list(bounds) for axis, bounds in metadata.command_limits.items()}
     return {"file": path.name, "command_limits": limits, "recipe": metadata.recipe}
 

@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot, load_robot
 from quadvel_recordings.output import atomic_write
 
 from .cells import Command, cell_record, command_limits, count_falls, largest_error, mean_error
@@ -29,40 +29,44 @@ COMMANDS: tuple[Command, ...] = (
 
 
 def _default_with_effect(
-    name: str, settings: Mapping[str, Any] | None = None, **parameters: float
+    robot: Robot, name: str, settings: Mapping[str, Any] | None = None, **parameters: float
 ) -> ActuatorParameters:
-    """The shipped actuator model with an effect on all joints."""
+    """The robot's actuator model with an effect on all joints."""
     effect = Effect(name, JOINT_NAMES, {**(settings or {}), **parameters})
-    return attrs.evolve(ActuatorParameters.of(ALIENGO), name=f"aliengo with {name}", effects=(effect,))
+    return attrs.evolve(ActuatorParameters.of(robot), name=f"{robot.name} with {name}", effects=(effect,))
 
 
-def _default_with_extra_delay() -> ActuatorParameters:
-    """The shipped actuator model with commands that take MORE_DELAY longer."""
-    default = ActuatorParameters.of(ALIENGO)
+def _default_with_extra_delay(robot: Robot) -> ActuatorParameters:
+    """The robot's actuator model with commands that take EXTRA_DELAY_S longer."""
+    default = ActuatorParameters.of(robot)
     pairs = tuple(attrs.evolve(p, input_delay_s=p.input_delay_s + EXTRA_DELAY_S) for p in default.pairs)
-    return attrs.evolve(default, name="aliengo with more delay", pairs=pairs)
+    return attrs.evolve(default, name=f"{robot.name} with more delay", pairs=pairs)
 
 
-def drive_conditions() -> list[Condition]:
+def drive_conditions(robot: Robot) -> list[Condition]:
     """List the plant of the actuator model and the plants with additional effects.
+
+    Args:
+        robot: The robot.
 
     Returns:
         One condition per plant.
     """
     drives = {
-        "as in training": ActuatorParameters.of(ALIENGO),
-        "friction": _default_with_effect("stribeck_friction", c=1.2, c_s=1.8, v_s=0.3, v_0=0.05),
-        "torque-speed limit": _default_with_effect("torque_speed_limit", stall=24.0, no_load=12.0),
-        "3 ms more delay": _default_with_extra_delay(),
-        "backlash": _default_with_effect("backlash", {"on": "q"}, gap=0.015),
+        "as in training": ActuatorParameters.of(robot),
+        "friction": _default_with_effect(robot, "stribeck_friction", c=1.2, c_s=1.8, v_s=0.3, v_0=0.05),
+        "torque-speed limit": _default_with_effect(robot, "torque_speed_limit", stall=24.0, no_load=12.0),
+        "3 ms more delay": _default_with_extra_delay(robot),
+        "backlash": _default_with_effect(robot, "backlash", {"on": "q"}, gap=0.015),
     }
     return [Condition("drives", name, {"actuator": parameters}) for name, parameters in drives.items()]
 
 
-def write_walk_log(policy: Path, plant: str, out: Path, seed: int = 0) -> None:
+def write_walk_log(robot: Robot, policy: Path, plant: str, out: Path, seed: int = 0) -> None:
     """Write a log of a mixed walk on one of the plants, for `quadvel identify`.
 
     Args:
+        robot: The robot, a shipped one.
         policy: ONNX file of the policy.
         plant: Level of one of `drive_conditions`.
         out: NPZ file to write, rows at 1 kHz.
@@ -71,10 +75,10 @@ def write_walk_log(policy: Path, plant: str, out: Path, seed: int = 0) -> None:
     Raises:
         ValueError: The plant is unknown.
     """
-    known = {one.level: one for one in drive_conditions()}
+    known = {one.level: one for one in drive_conditions(robot)}
     if plant not in known:
         raise ValueError(f"plant: found {plant!r}, expected one of {', '.join(known)}")
-    study = Study(policies={"walker": policy})
+    study = Study(robot=robot.name, policies={"walker": policy})
     log = record_mixed_walk(
         study.setup("walker", **known[plant].plant), seed, command_limits(study, "walker")
     )
@@ -134,7 +138,7 @@ class Gap(Section):
         return [
             condition_job(study, policy, one, command, seed)
             for policy in study.policies
-            for one in drive_conditions()
+            for one in drive_conditions(load_robot(study.robot))
             for command in self.commands
             for seed in range(study.seeds)
         ]

@@ -10,9 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from quadvel_description import robot
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import ALIENGO
+from quadvel_description.robot import Robot, load_robot
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
@@ -91,24 +90,25 @@ class RecordingSimulator(Simulator):
         return Log(name, JOINT_NAMES, t, q, dq, t, q_des, valid, tau=tau, tau_ff=tau_ff, kp=kp, kd=kd)
 
 
-def record_foot_lifting(seed: int, seconds: float) -> Log:
+def record_foot_lifting(robot: Robot, seed: int, seconds: float) -> Log:
     """Record the paper's foot-lifting motion (Eq. 9) on the ground, with the policy's rate and gains.
 
     Args:
+        robot: The robot.
         seed: Seed of the simulator.
         seconds: Duration, s.
 
     Returns:
         The log.
     """
-    simulator = RecordingSimulator(SimulatorConfig(robot=ALIENGO, seed=seed))
+    simulator = RecordingSimulator(SimulatorConfig(robot=robot, seed=seed))
     simulator.reset("stand")
-    start, targets = simulator.state().q, FootLifting(ALIENGO, seconds).targets()[::SIMULATOR_STEPS_PER_TICK]
-    kp, kd = np.full(12, robot.KP), np.full(12, robot.KD)
+    start, targets = simulator.state().q, FootLifting(robot, seconds).targets()[::SIMULATOR_STEPS_PER_TICK]
+    kp, kd = np.full(12, robot.kp), np.full(12, robot.kd)
     rise = np.linspace(0.0, 1.0, round(TRANSITION_TIME_S / CONTROL_PERIOD_S))[:, None]
     for target in np.vstack([start + rise * (targets[0] - start), targets]):
         state = simulator.state()
-        q = limit_torque(ALIENGO, target, state.q, state.dq, robot.KP, robot.KD)
+        q = limit_torque(robot, target, state.q, state.dq, robot.kp, robot.kd)
         simulator.command(JointCommand(q=q, kp=kp, kd=kd))
         simulator.step(SIMULATOR_STEPS_PER_TICK)
     return simulator.log(f"Eq. 9, seed {seed}", TRANSITION_TIME_S)
@@ -125,10 +125,11 @@ def record_mixed_walk(setup: Setup, seed: int, bounds: VelocityCommandLimits) ->
     Returns:
         The log.
     """
-    simulator = RecordingSimulator(SimulatorConfig(**{"robot": ALIENGO, "seed": seed, **setup.plant}))
+    robot = load_robot(setup.robot)
+    simulator = RecordingSimulator(SimulatorConfig(**{"robot": robot, "seed": seed, **setup.plant}))
     simulator.reset("stand")
     estimator = make_estimator(setup.estimator, simulator, setup.estimator_file)
-    loop = RobotLoop(simulator, Supervisor(ALIENGO, PolicyFile(ALIENGO, setup.policy)), estimator)
+    loop = RobotLoop(simulator, Supervisor(robot, PolicyFile(robot, setup.policy)), estimator)
     loop.start_walking()
     start = simulator.time
     fast, aside, turn = bounds.high
@@ -154,8 +155,11 @@ def identify_and_evaluate(
     Returns:
         Records of the quantities, then of the torques in the figure.
     """
-    heldout = record_foot_lifting(1, seconds) if data == "Eq. 9" else record_mixed_walk(setup, 1, bounds)
-    found = identify([record_foot_lifting(0, seconds)], [heldout])
+    robot = load_robot(setup.robot)
+    heldout = (
+        record_foot_lifting(robot, 1, seconds) if data == "Eq. 9" else record_mixed_walk(setup, 1, bounds)
+    )
+    found = identify([record_foot_lifting(robot, 0, seconds)], [heldout])
     before = found.report["before"]
     eam, pd = before["heldout_mse"], found.report["pd"]["heldout_mse"]
     numbers = {

@@ -15,8 +15,10 @@ import attrs
 import numpy as np
 from matplotlib.figure import Figure
 
-from quadvel_estimator.learned import SHIPPED_MODEL
-from quadvel_policy.policy_file import SHIPPED_POLICY
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
+from quadvel_estimator.learned import shipped_estimator
+from quadvel_policy.policy_file import shipped_policy
 
 from ..pool import Call
 from ..walk import Setup
@@ -30,16 +32,27 @@ class Study:
     """Policies, estimator and seeds of an evaluation.
 
     Attributes:
-        policies: ONNX files by their names in tables.
+        robot: Name of a shipped robot, or path of a robot.yaml.
+        policies: ONNX files by their names in tables; the default is the shipped one of the robot.
         estimator: Velocity estimator in the loop.
         estimator_file: ONNX file of the learned estimator.
         seeds: Number of seeds; they are 0, 1, ...
     """
 
-    policies: Mapping[str, Path] = attrs.field(factory=lambda: {SHIPPED_POLICY.stem: SHIPPED_POLICY})
+    robot: str = DEFAULT_ROBOT
+    policies: Mapping[str, Path] = attrs.field()
     estimator: str = "learned"
-    estimator_file: Path = SHIPPED_MODEL
+    estimator_file: Path = attrs.field()
     seeds: int = 3
+
+    @policies.default
+    def _shipped_policy(self) -> Mapping[str, Path]:
+        file = shipped_policy(load_robot(self.robot))
+        return {file.stem: file}
+
+    @estimator_file.default
+    def _shipped_estimator(self) -> Path:
+        return shipped_estimator(load_robot(self.robot))
 
     def setup(self, policy: str, **plant: Any) -> Setup:
         """Return the walk setup of a policy.
@@ -52,6 +65,7 @@ class Study:
             The setup.
         """
         return Setup(
+            robot=self.robot,
             policy=self.policies[policy],
             estimator=self.estimator,
             estimator_file=self.estimator_file,

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
-from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
+from quadvel_description.robot import load_robot
 
 from ..robot_loop import CONTROL_PERIOD_S
 from ..walk import Setup, make_loop, record_until_fall
@@ -71,13 +71,14 @@ def measure_sustained(setup: Setup, seed: int, direction: Command, speed: float)
     )
     loop, last = make_loop(setup, seed, ()), slice(-round(EVALUATED_TIME_S / CONTROL_PERIOD_S), None)
     walk, stood = record_until_fall(loop, [(share * speed * along, CONTROL_PERIOD_S) for share in shares])
+    robot = load_robot(setup.robot)
     assert walk is not None  # it stood when it began
     return {
         "reached": float(walk.velocity[last].mean(axis=0) @ along) if stood else None,
         "fell": int(not stood),
         "ended": "" if stood else loop.supervisor.reason,
-        "joint_speed": float((np.abs(walk.joint_velocity[last]) / VELOCITY_LIMIT).max()),
-        "torque": float((np.abs(walk.torque[last]) / TORQUE_LIMIT).max()),
+        "joint_speed": float((np.abs(walk.joint_velocity[last]) / robot.velocity_limit).max()),
+        "torque": float((np.abs(walk.torque[last]) / robot.torque_limit).max()),
     }
 
 
