@@ -165,12 +165,10 @@ def test_the_robot_itself_stands_up_and_walks_only_on_an_operators_call() -> Non
 
 
 def test_every_node_that_has_to_know_the_robot_is_told_its_name_or_file() -> None:
-    overrides = Stack(low_level="driver", robot="go2").node_parameters()
-    assert {name for name, values in overrides.items() if values.get("robot") == "go2"} == {
-        "driver",
-        "estimator",
-        "controller",
-    }
+    for low_level, serving in (("driver", {"driver"}), ("sim", {"sim_node"}), ("board", {"board", "driver"})):
+        overrides = Stack(low_level=low_level, robot="go2").node_parameters()
+        told = {name for name, values in overrides.items() if values.get("robot") == "go2"}
+        assert told == {*serving, "estimator", "controller"}
     file = Stack(low_level="external", robot="mine/robot.yaml").node_parameters()["controller"]["robot"]
     assert file == str(Path("mine/robot.yaml").resolve())
 
