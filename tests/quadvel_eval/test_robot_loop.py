@@ -73,7 +73,7 @@ def test_the_supervisor_walks_on_the_estimate_of_the_state_before(standing_polic
             used.append(inputs.velocity)
             return super().tick(inputs)
 
-    loop = RobotLoop(simulator, Spy(standing_policy), TrueVelocity(simulator))
+    loop = RobotLoop(simulator, Spy(ALIENGO, standing_policy), TrueVelocity(simulator))
     truths = [loop.tick().truth.linear_velocity for _ in range(5)]
     assert used[0] is None
     for velocity, truth in zip(used[1:], truths, strict=False):

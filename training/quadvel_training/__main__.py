@@ -199,7 +199,8 @@ def tune_policy(
 
 
 Plant = Annotated[
-    str, typer.Option(help=f"One of the gap's: {', '.join(p.level for p in gap.drive_conditions())}.")
+    str,
+    typer.Option(help="A plant of the gap, such as backlash or friction; a wrong name lists all of them."),
 ]
 WalkingPolicy = Annotated[Path, typer.Option(help="Policy file that walks.", exists=True)]
 
