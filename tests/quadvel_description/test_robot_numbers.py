@@ -27,7 +27,9 @@ def peculiar_numbers(robot: str) -> set[float]:
             yield abs(value)
 
     content = yaml.safe_load((load_robot(robot).folder / "robot.yaml").read_text())
-    return {one for one in numbers(content) if len(f"{one:.12g}".replace(".", "").lstrip("0")) >= 4} - ANY_ROBOT
+    return {
+        one for one in numbers(content) if len(f"{one:.12g}".replace(".", "").lstrip("0")) >= 4
+    } - ANY_ROBOT
 
 
 def module_level(tree: ast.Module) -> Iterator[ast.AST]:

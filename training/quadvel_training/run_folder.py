@@ -95,7 +95,7 @@ class EvaluatedPolicies(loop.Keeper):
         run.write_policy(policy, {"samples": run.samples})
         name = run.config.actuator
         plant = {} if name in ACTUATORS else {"actuator": load_actuator(load_robot(run.config.robot), name)}
-        found = _evaluate(Setup(policy=policy, plant=plant))
+        found = _evaluate(Setup(robot=run.config.robot, policy=policy, plant=plant))
         write_json(kept.with_suffix(".json"), found)
         figures = ("falls", "mean_error_xy", "max_error_xy")
         return {f"eval_{name}": float(found[name]) for name in figures}
