@@ -182,7 +182,7 @@ def test_what_is_not_fit_to_use_is_refused_counted_and_named(bench: Bench) -> No
         ),
         ("reset_gap:=0.0", "parameters: EstimatorParameters.reset_gap: found 0.0, expected above 0"),
         ("reset_gap:=soon", "parameter reset_gap: "),
-        ("speed:=3", "unknown parameter speed, expected one of realtime_priority, cpus, kind, model"),
+        ("speed:=3", "unknown parameter speed, expected one of realtime_priority, cpus, robot, kind, model"),
     ],
 )
 def test_a_wrong_parameter_ends_the_start_with_one_sentence(
