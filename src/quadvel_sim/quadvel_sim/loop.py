@@ -77,7 +77,7 @@ class SimulationLoop:
         simulator: The simulated robot; replaced by `reset` if a new one is passed.
         mode: `realtime`, `lockstep` or `fast`.
         period: Simulated time between two published states, ms.
-        receive: Called by `run` in its thread before each period is simulated, and during a pause.
+        receive: Called in the thread of `run` before each period is simulated, and during a pause.
             The command that it returns takes effect at the end of the period.
     """
 
@@ -142,11 +142,10 @@ class SimulationLoop:
             self._anchor_clock()
             self._publish_state()
             while not self._stopped:
-                is_ready = self._wait_until_ready()
-                if is_ready or self._is_halted:
-                    self._receive_command()
-                if is_ready:
+                if self._wait_until_ready():
                     self.advance()
+                elif self._is_halted:
+                    self._receive_command()
 
     def stop(self) -> None:
         """Make `run` return."""
@@ -157,6 +156,7 @@ class SimulationLoop:
     def advance(self) -> None:
         """Simulate one period (or the steps left to a paused simulation) and publish the state."""
         with self._condition:
+            self._receive_command()
             self._answered = False
             steps = self._next_steps
             self._simulate(steps)
