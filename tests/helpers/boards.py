@@ -1,4 +1,4 @@
-"""States that boards may report, and simulated boards that run in threads."""
+"""States that boards may report, and simulated boards that run in a thread."""
 
 from __future__ import annotations
 
@@ -70,13 +70,12 @@ def running(board: Board, simulator: Simulator) -> Iterator[None]:
     """Run a standing robot behind a board; states are published every 2 ms."""
     simulator.reset("stand")
     board.loop = SimulationLoop(simulator, board.publish, period=2, answer_timeout=0.0)
-    threads = [threading.Thread(target=run) for run in (board.run, board.loop.run)]
-    for thread in threads:
-        thread.start()
+    board.loop.receive = board.receive
+    thread = threading.Thread(target=board.loop.run)
+    thread.start()
     try:
         yield
     finally:
         board.loop.stop()
-        board.stop()
-        for thread in threads:
-            thread.join()
+        thread.join()
+        board.close()

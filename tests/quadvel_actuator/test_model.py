@@ -210,3 +210,14 @@ def test_a_delay_out_of_range_is_refused():
 def test_parameters_for_another_number_of_joints_are_refused():
     with pytest.raises(ValueError, match="torque_limit: found 3 numbers, expected 1 or 2"):
         ActuatorModel(ActuatorParameters.of(ALIENGO), (2,))
+
+
+def test_parameters_of_some_joints_are_not_taken_for_those_of_all():
+    some = attrs.evolve(
+        ActuatorParameters.of(ALIENGO),
+        delta_kp=(1.0, 2.0, 3.0),
+        joints=("FR_hip_joint", "FL_hip_joint", "RL_hip_joint"),
+    )
+    with pytest.raises(ValueError, match=r"joints: found 3 names \(FR_hip_joint, .*\), expected 12"):
+        ActuatorModel(some)
+    ActuatorModel(some, (3,))

@@ -115,6 +115,24 @@ def test_destroyed_endpoints_leave_the_graph(ros: Start, spin_until: SpinUntil) 
     assert spin_until(node, lambda: node.count_publishers("chatter") == 0)
 
 
+def test_only_endpoints_that_changed_are_read_again(ros: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    ros()
+    node = Node("talker")
+    for i in range(40):
+        node.create_publisher(String, f"chatter_{i}", 1)
+    place = node.context.participant
+    before = len(place.endpoints("publication"))
+    assert before > 40
+    read, builtin = [], place._builtin["publication"]
+    take = builtin.read
+    monkeypatch.setattr(builtin, "read", lambda **words: read.extend(found := take(**words)) or found)
+    one = node.create_publisher(String, "one_more", 1)
+    assert len(place.endpoints("publication")) == before + 1
+    node.destroy_publisher(one)
+    assert len(place.endpoints("publication")) == before
+    assert len(read) == 2
+
+
 def test_type_hash_stands_in_the_user_data(ros: Start) -> None:
     from cyclonedds.qos import Policy
 

@@ -11,6 +11,7 @@ import pytest
 
 from quadvel_description.state import MODE_SERVO, JointCommand
 from quadvel_driver import wire
+from quadvel_driver.board_state import BoardState
 from quadvel_driver.link import SHUTDOWN_PACKETS, LinkError, clamp_for_board
 from quadvel_driver.udp import UdpConfig, UdpTransport
 from tests.helpers.robots import ALIENGO
@@ -114,6 +115,26 @@ def test_of_states_that_wait_the_newest_wins(board: TestBoard, connect: Connect)
     counts = again.link.report().counts
     more = [counts[name] - before[name] for name in ("late", "repeated")]
     assert (counts["superseded"], *more) == (2, 1, 1)
+
+
+def test_after_a_stall_only_the_newest_states_are_decoded(
+    board: TestBoard, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    linked = connect()
+    linked.link.brake()  # lets the board know the link
+    decode, ticks = wire.decode_state, []
+
+    def note(data: bytes) -> BoardState:
+        state = decode(data)
+        ticks.append(state.robot.tick)
+        return state
+
+    monkeypatch.setattr(wire, "decode_state", note)
+    for tick in range(1000, 1060):
+        board.send(wire.encode_state(standing(tick)))
+    linked.link.serve()
+    assert ticks[-1] == 1059
+    assert len(ticks) <= 10
 
 
 def corrupted(data: bytes) -> bytes:

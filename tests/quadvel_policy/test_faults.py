@@ -298,6 +298,21 @@ def test_without_the_guard_its_row_does_not_hold(policy: Any, guard: type[Guard]
         check_row(policy, guard, tuple(other for other in GUARDS if other is not guard))
 
 
+@pytest.mark.parametrize(("missed", "fault"), [(10, ""), (30, "overruns")])
+def test_drives_that_brake_because_commands_are_late_are_not_reported_as_silent(
+    policy: Any, missed: int, fault: str
+) -> None:
+    rig = Rig(policy).stand()
+    rig.inputs["overruns"] = missed
+    for k in range(60):
+        rig.tick(**silent_drive(rig, k))
+    assert rig.supervisor.fault == fault
+    rig.inputs["overruns"] = 0
+    for k in range(60):
+        rig.tick(**silent_drive(rig, k))
+    assert rig.supervisor.fault == "drive_does_not_answer"
+
+
 @pytest.mark.parametrize("guard", [g for g in GUARDS if g.level is Level.DAMPING], ids=lambda g: g.name())
 @pytest.mark.parametrize("mode", ["stand_up", "stance", "lie_down"])
 def test_postures_are_guarded_as_walking_is(policy: Any, guard: type[Guard], mode: str) -> None:

@@ -20,6 +20,7 @@ from quadvel_driver.link import NO_CALIBRATION, Link
 from quadvel_driver.udp import UdpConfig, UdpTransport
 from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.board import Board, BoardError
+from quadvel_sim.loop import SimulationLoop
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.udp_board import UdpBoard
 from tests.helpers.boards import running, wait_for
@@ -129,6 +130,21 @@ def test_it_reports_the_mode_that_each_motor_was_asked_for(serve: Serve) -> None
             client.send(bytes(packet))
             modes = wire.decode_state(client.recv(2048)).motor_mode.tolist()
     assert modes == [0 if joint == 4 else 10 for joint in range(12)]
+
+
+def test_of_commands_that_waited_during_a_stall_the_newest_is_executed_at_once() -> None:
+    board = UdpBoard(("127.0.0.1", 0), NetworkConfig())
+    board.loop = SimulationLoop(Simulator(SimulatorConfig(robot=ALIENGO)), board.publish, period=1, answer_timeout=0.0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.connect(board.address)
+        for kp in range(100):
+            client.send(wire.encode_command(JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, float(kp)))))
+        command = board.receive()
+    assert command is not None
+    np.testing.assert_array_equal(command.kp, 99.0)
+    assert board.receive() is None
+    assert board.counts == {"commands": 1}
+    board.close()
 
 
 def test_it_names_the_reason_of_the_last_datagram_that_it_could_not_use(serve: Serve) -> None:

@@ -351,3 +351,23 @@ def test_a_diverged_simulation_ends_the_run(tmp_path: Path, monkeypatch: pytest.
     bench.loop.simulator.data.qvel[0] = np.nan
     with pytest.raises(FloatingPointError):
         bench.loop.run()
+
+
+def test_a_command_that_is_fetched_takes_effect_at_the_end_of_the_period() -> None:
+    bench = Bench("realtime", period=1)
+    commands = {3: 2.0, 8: 3.0}  # torque, N m, by the number of the period in which it arrives
+    torques: list[float] = []
+
+    def receive() -> JointCommand | None:
+        torque = commands.get(bench.loop.tick)
+        return None if torque is None else command(torque, bench.loop.tick)
+
+    def note(state: RobotState, instant: float) -> None:
+        torques.append(float(state.tau[0]))
+        bench.clock.now = 100.0 + 1e-3 * (state.tick + 1) + 2e-4  # the next wake-up is late
+        if state.tick == 12:
+            bench.loop.stop()
+
+    bench.loop._publish, bench.loop.receive = note, receive
+    bench.loop.run()
+    assert torques == pytest.approx([0.0] * 5 + [2.0] * 5 + [3.0] * 3, abs=1e-9)

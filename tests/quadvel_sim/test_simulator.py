@@ -139,6 +139,20 @@ def test_a_jammed_joint_hardly_moves_until_the_reset() -> None:
     np.testing.assert_allclose(np.delete(moved[0], 8), np.delete(moved[1], 8), atol=0.02)
 
 
+@pytest.mark.parametrize("torque", [36.0, -36.0])
+def test_the_largest_torque_does_not_move_a_jammed_joint(torque: float) -> None:
+    sim = simulator(suspended=True)
+    sim.reset("stand")
+    sim.jam_joint("RR_calf_joint")
+    before = sim.data.qpos[7 + 8]
+    pushing = hold()
+    pushing.kp[8] = pushing.kd[8] = 0.0
+    pushing.tau[8] = torque
+    run(sim, pushing, 0.3)
+    assert abs(sim.data.qpos[7 + 8] - before) < 1e-4
+    assert abs(sim.state().tau[8] - torque) < 1.0
+
+
 def test_faults_of_unknown_joints_are_refused() -> None:
     sim = simulator()
     for inject in (sim.fail_joint, sim.jam_joint):

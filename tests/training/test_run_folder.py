@@ -6,6 +6,7 @@ import json
 
 import attrs
 import pytest
+from typer.testing import CliRunner
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
@@ -13,6 +14,7 @@ from quadvel_actuator import ActuatorParameters, Effect  # noqa: E402
 from quadvel_description.quadruped import JOINT_NAMES  # noqa: E402
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import loop, run_folder, stages  # noqa: E402
+from quadvel_training.__main__ import app  # noqa: E402
 from quadvel_training.constrained import ConstrainedConfig  # noqa: E402
 from quadvel_training.loop import Budget  # noqa: E402
 from quadvel_training.networks import Recurrent  # noqa: E402
@@ -57,3 +59,15 @@ def test_a_run_keeps_what_it_is_and_how_it_fared(tmp_path, monkeypatch, drives):
     assert training_record["samples"] == 18
     assert training_record["hours"] >= 0.0
     assert training_record["configuration"]["actuator"] == drives.name  # in a file that goes elsewhere
+
+
+def test_actuators_of_some_joints_are_refused_before_training(tmp_path, drives):
+    some = ("FR_hip_joint", "FR_thigh_joint", "FR_calf_joint")
+    attrs.evolve(ActuatorParameters.load(drives), joints=some, effects=()).save(drives)
+    start = tmp_path / "start.pt"
+    start.touch()
+    arguments = ["tune", "--actuator", str(drives), "--policy", str(start), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert "found 3 names" in result.output
+    assert not (tmp_path / "out").exists()

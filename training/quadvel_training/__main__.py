@@ -14,7 +14,7 @@ import torch
 import typer
 from rich.progress import Progress, TextColumn
 
-from quadvel_actuator.parameters import ActuatorParameters
+from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_estimator.kalman import KalmanConfig
@@ -168,9 +168,9 @@ def train_ablation(
 
 
 def _actuator_file(path: Path) -> Path:
-    """Check an actuator file given as an option."""
+    """Check an actuator file given as an option: it must fit all joints of the robot."""
     try:
-        ActuatorParameters.load(load_robot(DEFAULT_ROBOT), path)
+        ActuatorModel(ActuatorParameters.load(load_robot(DEFAULT_ROBOT), path))
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
     return path

@@ -83,6 +83,9 @@ class ActuatorModel:
         self.dt = dt
         self._rng = np.random.default_rng(seed)
         joints = shape[-1]
+        if parameters.joints and len(parameters.joints) != joints:  # else 3 of 12 pass as hip, thigh, calf
+            found = f"{len(parameters.joints)} names ({', '.join(parameters.joints)})"
+            raise ValueError(f"actuator {parameters.name}: joints: found {found}, expected {joints}")
         limit = _per_joint("torque_limit", parameters.torque_limit, joints)
         self._limit = np.broadcast_to(limit, shape).copy()
         self._floor = -self._limit
@@ -114,10 +117,6 @@ class ActuatorModel:
         if not parameters.effects:
             return None
         names = parameters.joints or JOINT_NAMES
-        if len(names) != self.shape[-1]:
-            raise ValueError(
-                f"actuator {parameters.name}: joints: found {len(names)} names, expected {self.shape[-1]}"
-            )
         try:
             return RunningEffects(parameters.effects, names, self.shape, self.dt, seed)
         except ValueError as error:

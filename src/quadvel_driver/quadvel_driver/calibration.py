@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import yaml
 
 from quadvel_description.arrays import Array
 from quadvel_description.bounded_yaml import read_yaml
-from quadvel_description.kinematics import rotate, rotate_inverse
+from quadvel_description.kinematics import rotation_matrix
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.state import JointCommand, RobotState
 
@@ -107,6 +108,13 @@ class Calibration:
         share = 0.5 * np.sinc(0.5 * angle / np.pi)
         return np.array([np.cos(0.5 * angle), *(share * self.imu_mounting), 0.0])
 
+    @cached_property
+    def _turn(self) -> tuple[Array, Array]:
+        """Rotation matrix of the mounting, (3, 3), and the matrix of quaternion * mounting, (4, 4)."""
+        w, x, y, z = self.mounting.tolist()
+        product = np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
+        return rotation_matrix(self.mounting), product
+
     def apply(self, reported: RobotState) -> RobotState:
         """Correct a measured state: remove the encoder offsets and the tilt of the IMU.
 
@@ -118,13 +126,13 @@ class Calibration:
         Returns:
             The true state.
         """
-        turn = self.mounting
+        turn, product = self._turn
         return attrs.evolve(
             reported,
             q=reported.q - self.joint_zeros,
-            quaternion=_product(reported.quaternion, turn * [1.0, -1.0, -1.0, -1.0]),
-            angular_velocity=rotate(turn, reported.angular_velocity),
-            linear_acceleration=rotate(turn, reported.linear_acceleration),
+            quaternion=reported.quaternion @ product,  # a transposed product is that with the inverse
+            angular_velocity=turn @ reported.angular_velocity,
+            linear_acceleration=turn @ reported.linear_acceleration,
         )
 
     def as_reported(self, true: RobotState) -> RobotState:
@@ -136,13 +144,13 @@ class Calibration:
         Returns:
             The state as this robot would report it.
         """
-        turn = self.mounting
+        turn, product = self._turn
         return attrs.evolve(
             true,
             q=true.q + self.joint_zeros,
-            quaternion=_product(true.quaternion, turn),
-            angular_velocity=rotate_inverse(turn, true.angular_velocity),
-            linear_acceleration=rotate_inverse(turn, true.linear_acceleration),
+            quaternion=product @ true.quaternion,
+            angular_velocity=true.angular_velocity @ turn,
+            linear_acceleration=true.linear_acceleration @ turn,
         )
 
     def invert(self, wanted: JointCommand) -> JointCommand:
@@ -170,11 +178,3 @@ class Calibration:
 
 def _numbers(values: Mapping[str, Any], names: tuple[str, ...]) -> Array:
     return np.array([float(values[name]) for name in names])
-
-
-def _product(a: Array, b: Array) -> Array:
-    """Return the product a * b of two quaternions (w, x, y, z)."""
-    w, x, y, z = a
-    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    product: Array = left @ b
-    return product

@@ -36,6 +36,7 @@ SEND_PERIOD_S = 0.002  # longest time between two packets, as in Unitree's examp
 SHUTDOWN_PACKETS = 10  # number of damping packets at the end; some may be lost
 MAX_COMMAND_AGE_MS = 100  # largest age of the state that a command answers
 MAX_PACKETS = 256  # received per turn, so that a flood cannot block sending
+MAX_DECODED = 8  # of them, the newest: more wait only after a stall of the machine
 SILENCE_LIMIT_S = 0.1  # time without a new state after which the board counts as silent
 _TICK_MODULUS = 2**32
 
@@ -295,7 +296,9 @@ class Link:
     def _receive(self) -> None:
         """Receive all pending packets and call `on_state` with the newest state."""
         newest = None
-        for packet in self._packets():
+        packets = self._packets()
+        self._count("superseded", max(len(packets) - MAX_DECODED, 0))
+        for packet in packets[-MAX_DECODED:]:
             state = self._accept(packet)
             if state is None:
                 continue
@@ -337,9 +340,9 @@ class Link:
         state.robot = attrs.evolve(self._calibration.apply(state.robot), time=instant.time, tick=instant.tick)
         return state
 
-    def _count(self, name: str) -> None:
+    def _count(self, name: str, events: int = 1) -> None:
         with self._lock:
-            self._counts[name] += 1
+            self._counts[name] += events
 
     def _encode(self, command: JointCommand) -> bytes:
         sent = self._calibration.invert(clamp_for_board(command, self._robot))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from itertools import accumulate
 from typing import Any, Final, TypeAlias
 
@@ -89,6 +90,7 @@ def check_crc(kind: str, found: bytes, covered: bytes) -> None:
         raise WireError(f"{kind}: CRC is 0x{value:08X}, expected 0x{expected:08X}", CRC)
 
 
+@lru_cache(maxsize=1)  # the remote seldom changes from one state to the next
 def encode_remote(remote: Remote) -> bytes:
     """Encode the wireless remote.
 
@@ -105,6 +107,7 @@ def encode_remote(remote: Remote) -> bytes:
     return fields.tobytes()
 
 
+@lru_cache(maxsize=1)
 def decode_remote(data: bytes) -> Remote:
     """Decode the wireless remote.
 

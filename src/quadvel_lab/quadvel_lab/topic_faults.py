@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Annotated, Any
@@ -479,12 +480,13 @@ def _faster(by: float) -> Change:
     return change
 
 
-def _late(seconds: float) -> Change:
-    """Delay every message by a duration, s."""
+def _late(count: int) -> Change:
+    """Hold every message back until `count` later ones have come."""
 
-    def change(relay: Relay, message: Message) -> Message:
-        time.sleep(seconds)
-        return message
+    def change(relay: Relay, message: Message) -> Message | None:
+        held = relay.memory.setdefault("held", deque())
+        held.append(message)
+        return held.popleft() if len(held) > count else None
 
     return change
 
@@ -569,7 +571,7 @@ FAULTS = (
 BOARD_FAULTS = (
     TopicFault("motor_hot", "motor_status", _hot),
     TopicFault("motor_dropped_out", "motor_status", _dropped_out),
-    TopicFault("overruns", change=_late(0.008)),
+    TopicFault("overruns", change=_late(2)),
 )
 """Faults that only a board reports, or whose lateness a simulated robot waits for."""
 

@@ -3,11 +3,14 @@
 What all boards share: commands and states pass an unreliable network as packets, which the drives
 execute if they are valid. If commands stop, the simulator's watchdog brakes the drives. `udp_board`
 and `dds_board` carry the packets.
+
+A board has no thread of its own. Once per period, the thread of the loop takes the packets that
+wait and executes the newest valid command, as a robot's firmware does; older ones are dropped. So
+packets that waited during a stall of the machine delay no later command.
 """
 
 from __future__ import annotations
 
-import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -24,8 +27,6 @@ from quadvel_driver.packets import CONTENT, JOINTS, WireError
 from quadvel_sim.bad_network import BadNetwork, NetworkConfig
 from quadvel_sim.loop import SimulationLoop
 
-STOP_POLL_PERIOD_S = 0.1
-"""Longest wait in s between two checks whether the board must stop."""
 TEMPERATURE_DEGC = 35
 """Reported temperature of motors and IMU; heating is not simulated."""
 _TICK_MODULUS = 2**32
@@ -51,14 +52,14 @@ class BoardFormat(Protocol):
 class Board(ABC):
     """Board of a simulated robot.
 
-    Set `loop` before `run` is called. `publish` is the callback of the loop and runs in its thread;
-    `run` needs a thread for itself.
+    `publish` and `receive` are callbacks of the loop and run in its thread. Set `loop`, and
+    `receive` as that of the loop, before the loop runs.
 
     Attributes:
         loop: The simulation that executes the commands.
         remote: State of the wireless remote that the board reports.
         battery: State of the battery that the board reports; None if its packets have none.
-        counts: Number of executed commands (`commands`) and of dropped packets, by cause.
+        counts: Number of executed commands (`commands`) and of refused packets, by cause.
         last_refusal: Reason why the latest packet was dropped.
     """
 
@@ -86,9 +87,7 @@ class Board(ABC):
         self._calibration = calibration
         self._clock = clock
         self._inbound, self._outbound = BadNetwork(network, 0), BadNetwork(network, 1)
-        self._lock = threading.Lock()  # guards outbound network and connection
         self._modes: NDArray[Any] = np.full(JOINTS, MODE_DAMPING)  # of each motor, as last commanded
-        self._is_stopped = False
 
     def publish(self, state: RobotState, instant: float) -> None:
         """Send a state to the client, if there is one.
@@ -106,34 +105,31 @@ class Board(ABC):
         packet = self._wire.encode_state(
             BoardState(reported, modes, 0 * warm, warm, TEMPERATURE_DEGC, self.remote, self.battery)
         )
-        with self._lock:
-            self._outbound.send(packet, self._clock())
+        self._outbound.send(packet, self._clock())
         self._send_states()
 
-    def run(self) -> None:
-        """Receive and execute commands until `stop` is called, then close the connection."""
-        try:
-            while not self._is_stopped:
-                self._wait(self._poll_timeout())
-                for packet in self._received():
-                    self._inbound.send(packet, self._clock())
-                for packet in self._inbound.pop_arrived(self._clock()):
-                    self._execute(packet)
-                self._send_states()
-        finally:
-            self._close()
+    def receive(self) -> JointCommand | None:
+        """Take the packets that wait, and send the states that the network has delayed until now.
 
-    def stop(self) -> None:
-        """Make `run` return; may be called from any thread."""
-        self._is_stopped = True
+        Returns:
+            The newest valid command, as an answer to the present state; None if there is none.
+        """
+        now = self._clock()
+        for packet in self._received():
+            self._inbound.send(packet, now)
+        self._send_states()
+        for packet in reversed(self._inbound.pop_arrived(now)):
+            if (command := self._decode(packet)) is not None:
+                return command
+        return None
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the connection, after the end of the loop."""
 
     @abstractmethod
     def _has_client(self) -> bool:
         """Return whether anyone receives states."""
-
-    @abstractmethod
-    def _wait(self, timeout: float) -> None:
-        """Wait for a packet, at most `timeout` s."""
 
     @abstractmethod
     def _received(self) -> list[bytes]:
@@ -141,34 +137,25 @@ class Board(ABC):
 
     @abstractmethod
     def _transmit(self, packet: bytes) -> None:
-        """Send a state packet; raise OSError if that fails. The caller locks."""
+        """Send a state packet; raise OSError if that fails."""
 
-    @abstractmethod
-    def _close(self) -> None:
-        """Close the connection."""
-
-    def _poll_timeout(self) -> float:
-        """Return the time in s until the next packet arrives, at most `STOP_POLL_PERIOD_S`."""
-        with self._lock:
-            soonest = min(self._inbound.next_arrival, self._outbound.next_arrival)
-        return min(max(soonest - self._clock(), 0.0), STOP_POLL_PERIOD_S)
-
-    def _execute(self, packet: bytes) -> None:
-        """Execute a command packet now: the packets carry no time stamp."""
+    def _decode(self, packet: bytes) -> JointCommand | None:
+        """Return the command of a packet for the drives; None and counted if it is not valid."""
         try:
             command = self._calibration.as_executed(self._wire.decode_command(packet))
-            self._submit(command)
             self._modes = self._wire.commanded_modes(packet)
-            self.counts["commands"] += 1
         except ValueError as error:
             about = error.kind if isinstance(error, WireError) else CONTENT
             self._count_dropped(f"wrong_{about.lower()}", str(error))
+            return None
+        self.counts["commands"] += 1
+        return self._as_answer(command)
 
-    def _submit(self, command: JointCommand) -> None:
-        """Pass a command to the drives as an answer to the present state."""
+    def _as_answer(self, command: JointCommand) -> JointCommand:
+        """Return a command as an answer to the present state: the packets carry no time stamp."""
         assert self.loop is not None
         command.tick = self.loop.tick % _TICK_MODULUS
-        self.loop.submit(command)
+        return command
 
     def _count_dropped(self, name: str, why: str) -> None:
         """Count a dropped packet under `name` and keep the reason."""
@@ -177,11 +164,8 @@ class Board(ABC):
 
     def _send_states(self) -> None:
         """Send the states that have passed the outbound network."""
-        with self._lock:
-            if self._is_stopped or not self._has_client():
-                return
-            for packet in self._outbound.pop_arrived(self._clock()):
-                try:
-                    self._transmit(packet)
-                except OSError as error:  # the client is gone or full; the next state is sent again
-                    self._count_dropped("not_sent", f"a state can't be sent: {error}")
+        for packet in self._outbound.pop_arrived(self._clock()):
+            try:
+                self._transmit(packet)
+            except OSError as error:  # the client is gone or full; the next state is sent again
+                self._count_dropped("not_sent", f"a state can't be sent: {error}")

@@ -7,7 +7,6 @@ lx, ly, rx, ry, and the buttons in the order of their bits in the protocol.
 
 from __future__ import annotations
 
-from threading import Thread
 from typing import Any
 
 from sensor_msgs.msg import Joy
@@ -36,18 +35,15 @@ class BoardNode(SimulationNode[BoardParameters]):
         super().__init__("board", BoardParameters)
         settings = self._settings
         self._board = make_board(settings)
-        self._board.loop = self._loop
+        self._board.loop, self._loop.receive = self._loop, self._board.receive
         self._refused_before = 0
-        self._network = Thread(target=self._board.run, name="network")
         self.create_subscription(Joy, "~/remote", self._on_remote, 10)
-        self._network.start()
         self.start()
 
     def destroy_node(self) -> None:
-        """Stop the network, the simulation, then the node."""
-        self._board.stop()
-        self._network.join()
+        """Stop the simulation and the node, then close the board's connection."""
         super().destroy_node()
+        self._board.close()
 
     @override
     def publish_sample(self, state: RobotState, instant: float, view_is_due: bool) -> None:

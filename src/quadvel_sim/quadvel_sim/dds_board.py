@@ -101,17 +101,22 @@ class DdsBoard(Board):
         return True
 
     @override
-    def _wait(self, timeout: float) -> None:
-        self._bus.wait(min(timeout, HOLD_PERIOD_S) if self.mode else timeout)
+    def receive(self) -> JointCommand | None:
+        """Take the packets that wait, as every board does; a controller of the robot goes before.
+
+        Returns:
+            The command of the robot's own controller if it holds the legs, else the newest valid
+            one; None if there is none.
+        """
+        command = super().receive()
+        return self._hold() if self.mode else command
 
     @override
     def _received(self) -> list[bytes]:
-        """Answer requests, hold the legs if a controller of the robot has them, and return commands."""
+        """Answer requests and return commands."""
         for request in self._requests.dds.take(100):
             if request.sample_info.valid_data:
                 self._responses.dds.write(self._answer(request))
-        if self.mode:
-            self._hold()
         packets: list[bytes] = []
         while (sample := self._commands.take()) is not None:
             packets.append(sample[0])
@@ -133,26 +138,26 @@ class DdsBoard(Board):
             code = NOT_IMPLEMENTED
         return Response(ResponseHeader(request.header.identity, ResponseStatus(code)), data)
 
-    def _hold(self) -> None:
-        """Command the present posture, every HOLD_PERIOD_S."""
+    def _hold(self) -> JointCommand | None:
+        """Return a command of the present posture every HOLD_PERIOD_S, else None."""
         assert self.loop is not None
         now = self._clock()
         if now - self._held_at < HOLD_PERIOD_S:
-            return
+            return None
         self._held_at = now
         if self._posture is None:
             self._posture = self.loop.simulator.data.qpos[7:].copy()
         command = JointCommand(q=self._posture, kp=np.full(JOINTS, HOLD_KP), kd=np.full(JOINTS, HOLD_KD))
-        self._submit(command)
         if self._own_commands is not None:
             self._own_commands.write(wire.encode_command(command))
+        return self._as_answer(command)
 
     @override
-    def _execute(self, packet: bytes) -> None:
-        if self.mode:
-            self._count_dropped("held", f"the robot's own controller '{self.mode}' holds the legs")
-        else:
-            super()._execute(packet)
+    def _decode(self, packet: bytes) -> JointCommand | None:
+        if not self.mode:
+            return super()._decode(packet)
+        self._count_dropped("held", f"the robot's own controller '{self.mode}' holds the legs")
+        return None
 
     @override
     def _transmit(self, packet: bytes) -> None:
@@ -162,5 +167,5 @@ class DdsBoard(Board):
             raise OSError(str(error)) from error
 
     @override
-    def _close(self) -> None:
+    def close(self) -> None:
         self._bus.close()

@@ -1,6 +1,7 @@
 """Loop that runs a `Simulator` in real time, in lockstep with a controller, or fast. No ROS.
 
-Commands arrive from any thread through `submit`. States leave through a callback every `period` ms.
+Commands arrive from any thread through `submit`, or are fetched by the loop once per period
+(`receive`). States leave through a callback every `period` ms.
 
 Real time: the loop wakes once per period at an absolute deadline and simulates the period that has
 just passed. A command takes effect at the simulated millisecond that follows its arrival, as if the
@@ -42,6 +43,8 @@ PublishState = Callable[[RobotState, float], None]
 """Receives a state and its time in s."""
 ReportWaiting = Callable[[int, float], None]
 """Receives the tick at which simulated time stands still, and the present time in s."""
+FetchCommand = Callable[[], "JointCommand | None"]
+"""Returns the newest command since the last call; None if there is none."""
 
 
 @attrs.frozen
@@ -74,6 +77,8 @@ class SimulationLoop:
         simulator: The simulated robot; replaced by `reset` if a new one is passed.
         mode: `realtime`, `lockstep` or `fast`.
         period: Simulated time between two published states, ms.
+        receive: Called in the thread of `run` before each period is simulated, and during a pause.
+            The command that it returns takes effect at the end of the period.
     """
 
     def __init__(
@@ -104,6 +109,7 @@ class SimulationLoop:
         self.simulator = simulator
         self.mode = mode
         self.period = period
+        self.receive: FetchCommand = lambda: None
         self._publish, self._report_waiting = publish, report_waiting
         self._answer_timeout = answer_timeout
         self._clock = clock
@@ -138,6 +144,8 @@ class SimulationLoop:
             while not self._stopped:
                 if self._wait_until_ready():
                     self.advance()
+                elif self._is_halted:
+                    self._receive_command()
 
     def stop(self) -> None:
         """Make `run` return."""
@@ -148,6 +156,7 @@ class SimulationLoop:
     def advance(self) -> None:
         """Simulate one period (or the steps left to a paused simulation) and publish the state."""
         with self._condition:
+            self._receive_command()
             self._answered = False
             steps = self._next_steps
             self._simulate(steps)
@@ -166,15 +175,7 @@ class SimulationLoop:
         """
         arrival = self._clock()
         with self._condition:
-            self._check_command(command)
-            if self._is_halted:  # all commands of a halt take effect at one instant: the newest counts
-                self._inbox.clear()
-            self._inbox.append((arrival, command))
-            self._answered_tick = max(self._answered_tick or 0, self.tick - self._command_age(command))
-            if self.mode == LOCKSTEP:
-                self._answered = True
-            if self.mode == LOCKSTEP or self._waiting_since is not None:
-                self._condition.notify_all()
+            self._accept(command, arrival)
 
     def reset(self, keyframe: str, simulator: Simulator | None = None) -> None:
         """Reset the robot; this takes one period of simulated time, and time continues.
@@ -276,6 +277,25 @@ class SimulationLoop:
     def _real_time(self, tick: int) -> float:
         """Return the clock time at which `tick` is due, s."""
         return self._anchor_time + (tick - self._anchor_tick) * DT
+
+    def _receive_command(self) -> None:
+        """Fetch a command; it arrived before the end of the period that is simulated next."""
+        command = self.receive()
+        if command is not None:
+            end = self._real_time(self.tick + self._next_steps)
+            self._accept(command, min(self._clock(), end - 0.5 * DT))
+
+    def _accept(self, command: JointCommand, arrival: float) -> None:
+        """Queue a command that arrived at `arrival` (s); raise ValueError if it is invalid."""
+        self._check_command(command)
+        if self._is_halted:  # all commands of a halt take effect at one instant: the newest counts
+            self._inbox.clear()
+        self._inbox.append((arrival, command))
+        self._answered_tick = max(self._answered_tick or 0, self.tick - self._command_age(command))
+        if self.mode == LOCKSTEP:
+            self._answered = True
+        if self.mode == LOCKSTEP or self._waiting_since is not None:
+            self._condition.notify_all()
 
     def _wait_until_ready(self) -> bool:
         """Return whether the next period may be simulated; if not, wait for a while first."""

@@ -24,7 +24,7 @@ from quadvel_actuator import ActuatorModel
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.kinematics import rotate, rotate_inverse
 from quadvel_description.mjcf import Plant, build_spec
-from quadvel_description.quadruped import LEGS, joint_index
+from quadvel_description.quadruped import JOINT_NAMES, LEGS, joint_index
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_sim import persons
 from quadvel_sim.config import SensorNoise, SimulatorConfig
@@ -37,7 +37,8 @@ __all__ = ["DT", "SensorNoise", "Simulator", "SimulatorConfig", "Truth"]
 DT = 0.001
 """Time step, s."""
 _TICK_MODULUS = 2**32
-_JAM_TORQUE = 500.0  # N m, friction of a jammed joint
+# Limit of a jammed joint: time constant of two steps (s), damping ratio; impedance that hardly yields.
+_JAM_SOLREF, _JAM_SOLIMP = (2.0 * DT, 1.0), (0.999, 0.9999, 1e-3, 0.5, 2.0)
 _PAYLOAD_RADIUS_M = 0.05  # the payload is a solid sphere: I = 2/5 m r^2
 _Array = Array
 # q, kp, kd, dq, tau: arguments of ActuatorModel.step
@@ -168,7 +169,8 @@ class Simulator:
         world = self.config.world
         self._surroundings = None if world is None else Surroundings(self.model, world)
         self._noise = np.repeat(attrs.astuple(self.config.noise), (12, 12, 3, 3, 3))
-        self._joint_friction = self.model.dof_frictionloss.copy()
+        limits = self.model.jnt_range, self.model.jnt_solref, self.model.jnt_solimp
+        self._joint_limits = [(field, field.copy()) for field in limits]
         self.reset()
 
     def reset(self, keyframe: str = "lie", seed: int | None = None) -> None:
@@ -195,7 +197,8 @@ class Simulator:
             self.data.qpos[3:7] = tilt
         if self._surroundings is not None:
             self._surroundings.reset(self.data, seed)
-        self.model.dof_frictionloss[:] = self._joint_friction
+        for field, nominal in self._joint_limits:
+            field[:] = nominal
         self._failed_joints: list[int] = []
         self._pushes: list[_Push] = []
         self.steps = 0
@@ -335,7 +338,7 @@ class Simulator:
         self._failed_joints += joint_index([name])
 
     def jam_joint(self, name: str) -> None:
-        """Jam a joint by friction until the next reset; as MuJoCo's friction is soft, it still creeps.
+        """Jam a joint at its present angle until the next reset.
 
         Args:
             name: Name of the joint.
@@ -344,7 +347,9 @@ class Simulator:
             ValueError: The joint is unknown.
         """
         (joint,) = joint_index([name])
-        self.model.dof_frictionloss[6 + joint] = _JAM_TORQUE
+        jammed = self.model.joint(JOINT_NAMES[joint]).id
+        self.model.jnt_range[jammed] = self._q[joint]
+        self.model.jnt_solref[jammed], self.model.jnt_solimp[jammed] = _JAM_SOLREF, _JAM_SOLIMP
 
     def _apply_pushes(self) -> None:
         """Write the sum of all pushes into MuJoCo's state."""

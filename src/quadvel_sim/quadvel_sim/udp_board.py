@@ -6,7 +6,6 @@ of silence another sender may take its place.
 
 from __future__ import annotations
 
-import select
 import socket
 import time
 from collections.abc import Callable
@@ -62,10 +61,6 @@ class UdpBoard(Board):
         return self._client is not None
 
     @override
-    def _wait(self, timeout: float) -> None:
-        select.select([self._socket], [], [], timeout)
-
-    @override
     def _received(self) -> list[bytes]:
         """Return the datagrams of the client; select a client if there is none."""
         packets: list[bytes] = []
@@ -83,17 +78,15 @@ class UdpBoard(Board):
     def _is_client(self, sender: Address) -> bool:
         """Return whether a sender is served; it becomes the client if there is none."""
         now = self._clock()
-        with self._lock:
-            if self._client is None or now - self._last_heard > CLIENT_TIMEOUT_S:
-                self._client = sender
-            if sender != self._client:
-                self._count_dropped(
-                    "from_others",
-                    f"{_address_text(sender)} is not served, as {_address_text(self._client)} is",
-                )
-                return False
-            self._last_heard = now
-            return True
+        if self._client is None or now - self._last_heard > CLIENT_TIMEOUT_S:
+            self._client = sender
+        if sender != self._client:
+            self._count_dropped(
+                "from_others", f"{_address_text(sender)} is not served, as {_address_text(self._client)} is"
+            )
+            return False
+        self._last_heard = now
+        return True
 
     @override
     def _transmit(self, packet: bytes) -> None:
@@ -101,7 +94,7 @@ class UdpBoard(Board):
         self._socket.sendto(packet, self._client)
 
     @override
-    def _close(self) -> None:
+    def close(self) -> None:
         self._socket.close()
 
 

@@ -92,6 +92,8 @@ class Timer(Partial):
         """Return the monotonic time of the next deadline, or None (none, or simulated time)."""
         if self._canceled:
             return None
+        if not self._simulated and self.clock._simulated_ns is None:  # the monotonic clock is never set
+            return self._next_ns
         remaining = self._remaining_ns()  # first: it may change over to or from simulated time
         return None if self._simulated and remaining > 0 else time.monotonic_ns() + remaining
 

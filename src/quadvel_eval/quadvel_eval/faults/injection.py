@@ -237,7 +237,7 @@ def _dead_drive(stack: Stack, rng: Rng) -> None:
 
 
 def _jammed(stack: Stack, rng: Rng) -> None:
-    """Block one random thigh or calf joint by friction."""
+    """Block one random thigh or calf joint."""
     stack.simulator.jam_joint(JOINT_NAMES[int(rng.choice((1, 2, 4, 5, 7, 8, 10, 11)))])
 
 

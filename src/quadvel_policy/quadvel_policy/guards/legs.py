@@ -14,6 +14,8 @@ from ..guard import MOVING_MODES, WALK_MODES, Guard, GuardInput, Level
 
 ENCODER_WINDOW_S = 0.1  # window in which angles and speeds of the joints must agree
 TORQUE_WINDOW_S = 0.1  # window in which commanded and reported torques must agree
+DRIVE_WATCHDOG_S = 0.02  # time without a command after which driver and board brake the drives
+LATE_TICKS = 4  # consecutive missed deadlines, of 5 ms each, that last as long
 STUCK_RANGE_RAD = 0.05  # largest motion of a stuck joint
 NOTABLE_MOTION_RAD = 0.02  # motion of other joints that makes a constant sensor suspect
 
@@ -116,7 +118,9 @@ class DriveDoesNotAnswer(Guard):
     it has dropped out, commands do not reach it, or its report is wrong. A robot that reports no
     torque at any joint is not checked.
 
-    Both torques pass the same low-pass filter with the time constant TORQUE_WINDOW_S.
+    Both torques pass the same low-pass filter with the time constant TORQUE_WINDOW_S. Drives brake
+    by themselves if commands are later than DRIVE_WATCHDOG_S. Such ticks are left out: they say
+    nothing about the drives, and the guards of states and deadlines name the cause.
     """
 
     is_immediate = False
@@ -129,6 +133,8 @@ class DriveDoesNotAnswer(Guard):
     def check(self, data: GuardInput) -> str | None:
         if data.mode not in MOVING_MODES or not np.count_nonzero(data.state.tau):
             self._means[:] = 0.0
+            return None
+        if data.gap > DRIVE_WATCHDOG_S or data.overruns >= LATE_TICKS:
             return None
         share = -math.expm1(-max(data.gap, 0.0) / TORQUE_WINDOW_S)
         expected, reported = self._means

@@ -113,4 +113,4 @@ class Overruns(Guard):
     def check(self, data: GuardInput) -> str | None:
         if data.overruns <= data.config.max_overruns:
             return None
-        return f"{data.overruns} consecutive deadlines were missed, limit {data.config.max_overruns}"
+        return f"{data.overruns} consecutive deadlines were missed, limit {data.config.max_overruns:g}"
