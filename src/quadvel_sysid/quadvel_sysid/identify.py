@@ -27,7 +27,7 @@ from .logs.check_log import check_logs
 from .logs.findings import Finding
 from .logs.log import Log
 from .model.delays import central_equivalent_delay, quantised_delays
-from .model.fit import fit
+from .model.fit import fit, fit_delay_splits
 from .model.torque_model import Model
 from .options import DEFAULTS, IdentifyOptions, SearchOptions
 from .report.identification import Identification
@@ -144,7 +144,7 @@ def _identify_once(dataset: Dataset, options: IdentifyOptions, progress: Progres
         before=refitted[before],
         after=after,
         evidence=_evidence(search, searched.record, chosen, after, parts),
-        half_widths=intervals(after, parts, known_offsets(prepared.clocks)),
+        half_widths=intervals(after, parts, evaluator.noise, known_offsets(prepared.clocks)),
         noise=evaluator.noise,
         parts=parts,
         base=base,
@@ -231,6 +231,9 @@ def _comparisons(outcome: Outcome, replay: Replay | None) -> dict[str, Any]:
 
 def _heldout_gain(model: Model, index: int, parts: DataSplit) -> tuple[float, float]:
     """Error reduction (N^2 m^2) of an effect on the reported rows, and its p-value there."""
-    without = fit(model.without_effect(index), parts.fit_or_select)
+    rows = parts.fit_or_select
+    without = fit(model.without_effect(index), rows)
+    if model.effects[index].candidate.confounded_with_delays:
+        without = fit_delay_splits(without, rows)
     comparison = compare_residuals(parts, without.residual(), model.residual(), parts.report)
     return comparison.gain, comparison.p_value

@@ -32,7 +32,7 @@ from ..model.applied_effect import AppliedEffect
 from ..model.torque_model import Model
 from ..search.regressors import RegressorCandidate
 from ..statistics.baselines import explained_share, torque_variance
-from ..statistics.confidence import Intervals
+from ..statistics.confidence import InseparablePair, Intervals
 from ..statistics.criterion import (
     SIGNIFICANCE_LEVEL,
     WHITENESS_LEVEL,
@@ -210,6 +210,15 @@ def _report(o: Outcome) -> dict[str, Any]:
         "clocks": [_clock_entry(one) for one in o.clocks],
         "judged_rows": int(parts.report.any(axis=1).sum()),
         "effects": sorted(_effect_entries(o), key=lambda one: -one["heldout_gain"]),
+        "inseparable": [
+            {
+                "names": list(one.names),
+                "joint": samples.joints[one.joint],
+                "correlation": one.correlation,
+                "conditional": one.conditional,
+            }
+            for one in o.half_widths.inseparable
+        ],
         "rejected": [
             {"name": name, "selecting_gain": gain, "reason": why} for name, gain, why in o.evidence.rejected
         ],
@@ -218,6 +227,7 @@ def _report(o: Outcome) -> dict[str, Any]:
             f"{name} is at its bound: its value and interval are not valid" for name in o.half_widths.at_bound
         ]
         + _unconfirmed_warnings(o)
+        + [_inseparable_warning(one, list(samples.joints)) for one in o.half_widths.inseparable]
         + _delay_spread_warnings(o.after)
         + _torque_limit_warnings(o),
     }
@@ -287,6 +297,15 @@ def _unconfirmed_warnings(o: Outcome) -> list[str]:
     ]
 
 
+def _inseparable_warning(pair: InseparablePair, joints: Sequence[str]) -> str:
+    """Warning about two parameters of which only a combination is known."""
+    first, second = pair.names
+    return (
+        f"{first} and {second} are not separable in these logs (correlation of the estimates {pair.correlation:.3f} on "
+        f"{joints[pair.joint]}): if {second} were known, the interval of {first} would be {pair.conditional:.2f} times as wide"
+    )
+
+
 def _delay_spread_warnings(model: Model) -> list[str]:
     """Warnings about delays that differ between joints: a running model has one pair."""
     spread = 1e3 * float(np.ptp(model.delays, axis=1).max())
@@ -319,6 +338,7 @@ def _gain_entries(o: Outcome) -> dict[str, Any]:
         **dict(zip(_DELTAS, zip(gain_deviations(model), halves, strict=True), strict=True)),
         "input_delay_ms": (1e3 * model.delays[0], 1e3 * widths.delays[0]),
         "output_delay_ms": (1e3 * model.delays[1], 1e3 * widths.delays[1]),
+        "total_delay_ms": (1e3 * model.delays.sum(axis=0), 1e3 * widths.total_delay),
     }
     for name, (values, half) in rows.items():
         least = -np.inf if name.startswith("delta") else 0.0
