@@ -130,10 +130,10 @@ def _identify_once(dataset: Dataset, options: IdentifyOptions, progress: Progres
     # 3. Refit to all rows that are not reported; replays choose between nested models if there is a load.
     replay = None if load is None else Replay(load, prepared, base)
     progress(0.88, "replays" if replay else "intervals")
-    models = [before, best]
+    models = [before, best, best_effects]
     if replay:
         effects = best_effects if best_effects is best else search.prune(best_effects)
-        models = [before, effects, best, *search.nested_models(effects)]
+        models += [effects, *search.nested_models(effects)]
     refitted = {one: _refit_all_rows(one, prepared) for one in dict.fromkeys(models)}
     chosen = replay.choose(refitted) if replay else best
 
@@ -143,6 +143,7 @@ def _identify_once(dataset: Dataset, options: IdentifyOptions, progress: Progres
     outcome = Outcome(
         before=refitted[before],
         after=after,
+        effects_alone=refitted[best_effects],
         evidence=_evidence(search, searched.record, chosen, after, parts),
         half_widths=intervals(after, parts, evaluator.noise, known_offsets(prepared.clocks)),
         noise=evaluator.noise,

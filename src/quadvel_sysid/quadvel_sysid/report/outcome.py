@@ -101,6 +101,7 @@ class Outcome:
     Attributes:
         before: Plain EAM.
         after: Corrected model.
+        effects_alone: The best model without regressors of named signals.
         evidence: Evidence for and against effects.
         half_widths: 95 % confidence intervals of `after`.
         noise: Variance of the torque noise, (J,), N^2 m^2.
@@ -111,6 +112,7 @@ class Outcome:
 
     before: Model
     after: Model
+    effects_alone: Model
     evidence: Evidence
     half_widths: Intervals
     noise: Array
@@ -192,7 +194,9 @@ def _report(o: Outcome) -> dict[str, Any]:
         mses[name]["per_joint"] = [
             mean_square(errors[name][:, [j]], parts.report[:, [j]]) for j in range(len(samples.joints))
         ]
-    floor = float(np.average(o.noise, weights=np.maximum(parts.report.sum(axis=0), 1)))
+    # Where states are held, differences of rows overestimate the noise; it cannot exceed an error.
+    noise = float(np.average(o.noise, weights=np.maximum(parts.report.sum(axis=0), 1)))
+    floor = min(noise, mses["after"]["train_mse"] or noise)
     report = {
         "schema": SCHEMA,
         "joints": list(samples.joints),
@@ -210,6 +214,7 @@ def _report(o: Outcome) -> dict[str, Any]:
         "clocks": [_clock_entry(one) for one in o.clocks],
         "judged_rows": int(parts.report.any(axis=1).sum()),
         "effects": sorted(_effect_entries(o), key=lambda one: -one["heldout_gain"]),
+        "effects_alone": _effects_alone_entry(o) if o.regressors else None,
         "inseparable": [
             {
                 "names": list(one.names),
@@ -360,6 +365,15 @@ def _effect_entries(o: Outcome) -> list[dict[str, Any]]:
     if o.regressors:
         found.append(_regressors_entry(o, joints))
     return found
+
+
+def _effects_alone_entry(o: Outcome) -> dict[str, Any]:
+    """Entry of the report for the effects that explain most without regressors of named signals."""
+    model = o.effects_alone
+    return {
+        "names": list(dict.fromkeys(effect.candidate.name for effect in model.effects)),
+        "heldout_mse": mean_square(o.samples.tau - model.predictive().predict(), o.parts.report),
+    }
 
 
 def _regressors_entry(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
