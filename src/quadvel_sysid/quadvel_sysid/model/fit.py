@@ -81,7 +81,7 @@ _FAR_DELAY_CHANGES_S = np.array([-0.008, -0.007, -0.006, -0.005, -0.004, 0.004, 
 """Further changes of the sum alone, s: a missing effect may have biased the delays by so much."""
 _NEAR_DELAY_CHANGES_S = (-0.002, -0.001, 0.001, 0.002)
 """Coarse grid of changes of the sum of delays, s."""
-_SPLIT_CHANGES_S = np.array([-0.006, -0.004, -0.003, -0.002, -0.001, 0.001, 0.002, 0.003, 0.004, 0.006])
+_SPLIT_CHANGES_S = np.array([-0.004, -0.002, 0.002, 0.004])
 """Changes of the output delay, at an equal sum of delays, s; the bounds of the output delay clip them."""
 
 
