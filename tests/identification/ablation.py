@@ -30,7 +30,7 @@ BASELINE = "everything"
 SWITCHES: dict[str, dict[str, Any]] = {
     BASELINE: {},
     "second starts": {"second_starts": False},
-    "sharing per candidate": {"shared_trials": 0},
+    "several finished fits": {"finished_fits": 1},
     "regressors at nearby delays": {"regressors_at_nearby_delays": False},
     "finer regressors": {"finer_regressors": False},
     "half as many fits": {"fitted_effects": 3, "fitted_regressors": 2},

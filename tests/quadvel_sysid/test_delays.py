@@ -6,13 +6,18 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import ActuatorModel
+from quadvel_actuator.effects.dynamics import Armature, TimestampSkew
 from quadvel_sysid.data.plain_model import fit_eam
 from quadvel_sysid.data.signals import Samples
+from quadvel_sysid.data.split import DataSplit
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log
+from quadvel_sysid.model.applied_effect import AppliedEffect
 from quadvel_sysid.model.delays import central_equivalent_delay, quantised_delays, running_delays
-from quadvel_sysid.model.fit import fit, fit_delay_profile, squared_error
+from quadvel_sysid.model.fit import fit, fit_delay_profile, fit_delay_splits, squared_error
 from quadvel_sysid.model.torque_model import Model
+from quadvel_sysid.search.effect_candidates.dynamics import ArmatureCandidate, TimestampSkewCandidate
+from quadvel_sysid.statistics.confidence import intervals
 
 JOINTS = NAMES[:2]
 ONE = np.zeros(2, dtype=np.intp)
@@ -143,6 +148,49 @@ def test_averaging_of_encoder_noise_does_not_attract_the_output_delay():
     halfway = model.with_delays(np.repeat([[0.006], [0.002]], 2, axis=1))
     assert model.averaged_noise().max() < 1e-9
     assert halfway.averaged_noise()[5:].mean() == pytest.approx(0.5 * (0.48 * 0.3) ** 2, rel=0.15)
+
+
+def test_effects_that_filter_encoder_noise_are_compared_as_if_they_did_not():
+    """Late speeds and an inertia of kd times that time predict dq from its neighbours."""
+    quiet, rng, late = _driven(0.004, 0.0205, 3), np.random.default_rng(4), 0.003
+    log = attrs.evolve(quiet, dq=quiet.dq + 0.3 * rng.standard_normal(quiet.dq.shape))
+    model = Model(Samples.of([log]), 0.0, np.ones((2, 2)), ONE, np.repeat([[0.008], [0.0]], 2, axis=1), ONE)
+    both, own = np.ones(2, dtype=bool), np.arange(2)
+    skew = AppliedEffect(TimestampSkewCandidate(TimestampSkew("dq")), both, np.full((1, 2), late), own)
+    inertia = AppliedEffect(
+        ArmatureCandidate(Armature(of="ddq_sharp")), both, np.full((1, 2), 0.5 * late), own
+    )
+    rows = model.samples.evaluated
+    pair = model.with_effect(skew).with_effect(inertia)
+    assert model.noise_averaged_by_effects(rows) == pytest.approx(0.0)
+    removed = pair.noise_averaged_by_effects(rows)
+    assert ((removed > 0.3 * (0.5 * 0.3) ** 2) & (removed < (0.5 * 0.3) ** 2)).all()
+
+
+def test_other_splits_of_the_total_delay_are_tried():
+    samples = Samples.of([_log(1.0)])
+    wrong = Model(samples, 0.001, np.ones((2, 2)), ONE, np.repeat([[0.0035], [0.0045]], 2, axis=1), ONE)
+    found = fit_delay_splits(wrong, samples.evaluated)
+    assert found.delays[1] == pytest.approx(0.001, abs=5e-4)
+    assert squared_error(found, samples.evaluated) < 0.99 * squared_error(wrong, samples.evaluated)
+
+
+def test_parameters_that_one_frequency_does_not_separate_are_named():
+    """A sine has dq, q and ddq in proportion, so that damping passes for an output delay."""
+    rng, t = np.random.default_rng(5), np.arange(0.0, 4.0, 0.002)
+    q = 0.3 * np.sin(2 * np.pi * 2.0 * t[:, None] + np.array([0.0, 1.0]))
+    dq = 0.6 * 2 * np.pi * np.cos(2 * np.pi * 2.0 * t[:, None] + np.array([0.0, 1.0]))
+    q_des = np.repeat(rng.uniform(-0.2, 0.2, (len(t) // 10, 2)), 10, axis=0)
+    tau = 30.0 * (q_des - q) - 0.5 * dq + 0.05 * rng.standard_normal(q.shape)
+    gains = {"kp": np.full(q.shape, 30.0), "kd": np.full(q.shape, 0.5)}
+    log = Log("sine", JOINTS, t, q, dq, t, q_des, np.ones(q.shape, bool), tau=tau, **gains)
+    samples = Samples.of([log])
+    model = Model(samples, 0.0, np.ones((2, 2)), ONE, np.repeat([[0.001], [0.001]], 2, axis=1), ONE)
+    starts = np.arange(0, len(t), 50)
+    parts = DataSplit(samples.evaluated, samples.evaluated, samples.evaluated, starts)
+    found = intervals(model, parts, np.full(2, 0.0025))
+    assert ("delta_kd", "output_delay") in [one.names for one in found.inseparable]
+    assert (found.total_delay < found.delays[1]).all()
 
 
 def test_the_global_minimum_over_the_delays_is_found_with_step_commands():

@@ -17,6 +17,7 @@ def report(*effects: tuple[str, float]) -> dict[str, Any]:
         "before": {"heldout_mse": 1.0},
         "after": {"heldout_mse": 0.25, "train_mse": 0.25},
         "effects": [{"name": name, "p_value": p, "at_bound": False} for name, p in effects],
+        "effects_alone": None,
         "unexplained": {"verdict": "white", "depends_on": [], "edges": {"rows": 0.05, "error": 0.1}},
         "noise_floor": 0.2,
     }
@@ -53,6 +54,12 @@ def test_an_effect_whose_value_is_at_a_bound_is_not_added() -> None:
     assert "the model contains soft_stop as well, but a value of it is at a bound" in text
 
 
+def test_named_effects_that_learned_terms_replaced_are_stated() -> None:
+    found = report(("learned_residual", 1e-9))
+    found["effects_alone"] = {"names": ["armature", "first_order_lag"], "heldout_mse": 0.3}
+    assert "without learned terms, armature, first_order_lag leave 0.3 N^2 m^2" in summary_text(found)
+
+
 def test_errors_after_changes_of_commands_are_mentioned() -> None:
     found = report(("armature", 1e-9))
     found["unexplained"]["edges"]["error"] = 0.79
@@ -72,13 +79,17 @@ def test_reasons_against_a_result_replace_its_decision() -> None:
 def test_logs_that_are_left_out_in_turn_show_what_their_models_share() -> None:
     values = {"delta_kp": 0.0, "delta_kd": 0.0, "input_delay_ms": 5.0, "output_delay_ms": 0.0}
     folds = []
-    for name, error, effects in (("a", 0.2, ["armature"]), ("b", 0.4, ["armature", "cogging"])):
+    for name, error, effects, alone in (
+        ("a", 0.2, ["learned_residual"], {"names": ["armature"], "heldout_mse": 0.3}),
+        ("b", 0.4, ["armature", "cogging"], None),
+    ):
         folds.append(
             {
                 "before": {"heldout_mse": 1.0},
                 "after": {"heldout_mse": error, **values},
                 "baselines": {"ridge": {"heldout_mse": 0.5}},
                 "effects": [{"name": one} for one in effects],
+                "effects_alone": alone,
                 "clocks": [
                     {"log": "other", "command_offset_ms": 0.0},
                     {"log": name, "command_offset_ms": 0.4},
@@ -92,4 +103,4 @@ def test_logs_that_are_left_out_in_turn_show_what_their_models_share() -> None:
     ]
     text = leave_one_out_text(entry)
     assert "error 1 before, 0.3 after" in text
-    assert text.endswith("effects of all fits: armature; of some: cogging")
+    assert text.endswith("effects of all fits: armature; of some: learned_residual, cogging")

@@ -27,7 +27,7 @@ from .logs.check_log import check_logs
 from .logs.findings import Finding
 from .logs.log import Log, LogError
 from .model.delays import central_equivalent_delay, quantised_delays
-from .model.fit import fit
+from .model.fit import fit, fit_delay_splits
 from .model.torque_model import Model
 from .options import DEFAULTS, IdentifyOptions, SearchOptions
 from .report.identification import Identification
@@ -132,10 +132,10 @@ def _identify_once(dataset: Dataset, options: IdentifyOptions, progress: Progres
     # 3. Refit to all rows that are not reported; replays choose between nested models if there is a load.
     replay = None if load is None else Replay(load, prepared, base)
     progress(0.88, "replays" if replay else "intervals")
-    models = [before, best]
+    models = [before, best, best_effects]
     if replay:
         effects = best_effects if best_effects is best else search.prune(best_effects)
-        models = [before, effects, best, *search.nested_models(effects)]
+        models += [effects, *search.nested_models(effects)]
     refitted = {one: _refit_all_rows(one, prepared) for one in dict.fromkeys(models)}
     chosen = replay.choose(refitted) if replay else best
 
@@ -145,8 +145,9 @@ def _identify_once(dataset: Dataset, options: IdentifyOptions, progress: Progres
     outcome = Outcome(
         before=refitted[before],
         after=after,
+        effects_alone=refitted[best_effects],
         evidence=_evidence(search, searched.record, chosen, after, parts),
-        half_widths=intervals(after, parts, known_offsets(prepared.clocks)),
+        half_widths=intervals(after, parts, evaluator.noise, known_offsets(prepared.clocks)),
         noise=evaluator.noise,
         parts=parts,
         base=base,
@@ -233,6 +234,9 @@ def _comparisons(outcome: Outcome, replay: Replay | None) -> dict[str, Any]:
 
 def _heldout_gain(model: Model, index: int, parts: DataSplit) -> tuple[float, float]:
     """Error reduction (N^2 m^2) of an effect on the reported rows, and its p-value there."""
-    without = fit(model.without_effect(index), parts.fit_or_select)
+    rows = parts.fit_or_select
+    without = fit(model.without_effect(index), rows)
+    if model.effects[index].candidate.confounded_with_delays:
+        without = fit_delay_splits(without, rows)
     comparison = compare_residuals(parts, without.residual(), model.residual(), parts.report)
     return comparison.gain, comparison.p_value

@@ -50,7 +50,7 @@ class SearchOptions:
     lost_commands_at_random: bool = _switch("accept lost commands only if they are lost at random")
     fitted_effects: int = _option(6, "effects that are fitted after a screening", (1, 100))
     fitted_regressors: int = _option(4, "regressors that are fitted after a screening", (1, 100))
-    shared_trials: int = _option(3, "best candidates for which sharing across joints is tested", (0, 100))
+    finished_fits: int = _option(3, "best candidates after a few steps whose fits are finished", (1, 100))
     second_starts: bool = _switch("fit effects that shift the torque from two starts")
     regressors_at_nearby_delays: bool = _switch("refit regressors from nearby delays")
     finer_regressors: bool = _switch("refine the shapes of regressors after their screening")

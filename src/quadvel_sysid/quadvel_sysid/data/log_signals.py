@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from copy import copy
 from typing import Any
 
+import attrs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -80,6 +82,23 @@ class LogSignals:
         self._sharp = sharp
         self._slopes: dict[float, Array] = {}
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
+
+    def with_encoder_errors(self, q: Array, dq: Array) -> LogSignals:
+        """Add errors to the measured states.
+
+        Args:
+            q: (N, J) error of q, rad.
+            dq: (N, J) error of dq, rad/s.
+
+        Returns:
+            The signals as a log with these errors would have them, without smoothing of the errors.
+        """
+        other = copy(self)
+        other.log = attrs.evolve(self.log, q=self.log.q + q, dq=self.log.dq + dq)
+        other.states = {**self.states, "q": self.states["q"] + q, "dq": self.states["dq"] + dq}
+        other.signals = {**self.signals, **other.states}
+        other._slopes, other._smooth = {}, {}
+        return other
 
     def locate(self, at: Array) -> tuple[Indices, Array]:
         """Find the interval of state rows that holds each time.

@@ -36,6 +36,8 @@ _MAX_CACHED_VALUES = 400_000
 _ROW_FIELDS = ("log_of_row", "t", "tau", "start", "dt", "evaluated", "row", "lead")
 _JOINT_FIELDS = ("q", "dq", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature", "averaging")
 
+_NOISE_SEED = 0
+"""Seed of the noise that `Sources.with_more_noise` adds."""
 _GOLDEN_RATIO = 0.5 * (np.sqrt(5.0) - 1.0)
 """The fractional parts of its multiples fill the unit interval evenly and without a period."""
 
@@ -223,6 +225,21 @@ class Sources:
         )
         return q, dq
 
+    def with_more_noise(self) -> Sources:
+        """Add white noise to q and dq, with the variance of the noise that they have.
+
+        Returns:
+            The sources of the same logs with twice the variance of encoder noise.
+        """
+        rng, deviations = np.random.default_rng(_NOISE_SEED), np.sqrt(self.encoder_noise)
+        series = [
+            one.with_encoder_errors(*(rng.normal(0.0, each, one.log.q.shape) for each in deviations))
+            for one in self.series
+        ]
+        return attrs.evolve(
+            self, series=tuple(series), constant=_constant_signals([one.signals for one in series])
+        )
+
     def first(self, count: int) -> Sources:
         """Keep the first logs.
 
@@ -368,6 +385,11 @@ class Samples:
         start = np.diff(np.cumsum(self.start)[rows], prepend=-1) > 0
         dt = np.where(start, period, np.diff(t, prepend=t[0] - period))
         return attrs.evolve(self.take_rows(rows), start=start, dt=dt, period=period), rows
+
+    @cached_property
+    def noisier(self) -> Samples:
+        """The same rows with twice the variance of encoder noise in q and dq."""
+        return attrs.evolve(self, sources=self.sources.with_more_noise())
 
     @cached_property
     def upsampled(self) -> Samples:

@@ -55,6 +55,7 @@ class EffectCandidate:
         shifts: Whether it resembles a delay.
         acts_between_rows: Whether it also depends on what happens between the rows of a log.
         all_joints_together: Whether it happens to all joints of a robot at the same time.
+        possible_on_one_joint: Whether one of several joints can have it alone.
         motion: Motion to record in order to distinguish it from other effects.
         settings_to_try: Settings of the forms to try on a log.
         places: Where an added torque is tried.
@@ -65,6 +66,7 @@ class EffectCandidate:
     shifts: ClassVar[bool] = False
     acts_between_rows: ClassVar[bool] = False
     all_joints_together: ClassVar[bool] = False
+    possible_on_one_joint: ClassVar[bool] = True
     motion: ClassVar[str] = "richer motion"
     settings_to_try: ClassVar[Sequence[Mapping[str, str]]] = ({},)
     places: ClassVar[Sequence[str]] = (DRIVE, JOINT)
@@ -85,6 +87,14 @@ class EffectCandidate:
         At least one joint has to be free of it.
         """
         return False
+
+    @property
+    def confounded_with_delays(self) -> bool:
+        """Whether another split into input and output delay resembles the effect.
+
+        An output delay d changes the torque by kp d dq + kd d ddq: by damping and by inertia.
+        """
+        return self.shifts or self.confounded_with_gain
 
     @property
     def shared_by_joints(self) -> bool:

@@ -22,6 +22,8 @@ from ..parallel import parallel_map
 from .jacobian import DELAY_STEP_S, Unknowns, jacobian, pack, with_slots
 from .torque_model import MAX_DELAYS_S, Model
 
+MAX_ITERATIONS = 12
+"""Maximum number of Levenberg-Marquardt steps of a fit."""
 _CONVERGED = 2e-5
 """Relative reduction of the error below which a fit has converged."""
 _DAMPING_FACTORS = (1e-6, 1e-3, 0.1, 10.0)
@@ -35,7 +37,7 @@ RIDGE = 1e-4
 """Weight of the smoothness penalty on regressor weights, relative to their mean second moment."""
 
 
-def fit(model: Model, rows: Bools, iterations: int = 12, delays: bool = True) -> Model:
+def fit(model: Model, rows: Bools, iterations: int = MAX_ITERATIONS, delays: bool = True) -> Model:
     """Fit the parameters of a model by least squares.
 
     Args:
@@ -79,6 +81,8 @@ _FAR_DELAY_CHANGES_S = np.array([-0.008, -0.007, -0.006, -0.005, -0.004, 0.004, 
 """Further changes of the sum alone, s: a missing effect may have biased the delays by so much."""
 _NEAR_DELAY_CHANGES_S = (-0.002, -0.001, 0.001, 0.002)
 """Coarse grid of changes of the sum of delays, s."""
+_SPLIT_CHANGES_S = np.array([-0.004, -0.002, 0.002, 0.004])
+"""Changes of the output delay, at an equal sum of delays, s; the bounds of the output delay clip them."""
 
 
 def fit_delay_profile(
@@ -118,8 +122,27 @@ def fit_near_delays(model: Model, rows: Bools) -> Model:
     Returns:
         The model with the least squared error, among `model` and the fit from the best start.
     """
+    return _fit_from_best(model, rows, product(_NEAR_DELAY_CHANGES_S, (0.0,)))
+
+
+def fit_delay_splits(model: Model, rows: Bools) -> Model:
+    """Fit a model from other splits of the same total delay into input and output delay.
+
+    Args:
+        model: A fitted model.
+        rows: Samples to fit, (N, J) bool.
+
+    Returns:
+        The model with the least squared error, among `model` and the fit from the best start.
+    """
+    splits = np.unique(np.clip(model.delays[1].mean() + _SPLIT_CHANGES_S, 0.0, MAX_DELAYS_S[1]))
+    return _fit_from_best(model, rows, product((0.0,), splits - model.delays[1].mean()))
+
+
+def _fit_from_best(model: Model, rows: Bools, shifts: Iterable[tuple[float, float]]) -> Model:
+    """The better one of a model and its fit from the best of other delays."""
     samples, (model, rows) = model.samples, _fitted_rows_only(model, rows)
-    starts = _one_step_at_each_delay(model, rows, product(_NEAR_DELAY_CHANGES_S, (0.0,)))
+    starts = _one_step_at_each_delay(model, rows, shifts)
     tried = [model, *(fit(one, rows) for one in starts[:1])]
     return attrs.evolve(min(tried, key=lambda one: squared_error(one, rows)), samples=samples)
 

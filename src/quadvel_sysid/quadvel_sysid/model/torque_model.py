@@ -108,6 +108,32 @@ class Model:
         noise: Array = (self.gains[0] * s.kp) ** 2 * q_noise + (self.gains[1] * s.kd) ** 2 * dq_noise
         return noise * s.averaging
 
+    def noise_averaged_by_effects(self, rows: Bools) -> Array:
+        """Return the variance of encoder noise that the effects remove from the prediction.
+
+        Effects of earlier speeds and of accelerations can combine to a filter of dq: late speeds plus
+        an inertia of kd times that time are a prediction of dq from its neighbours. It reduces the
+        error by noise that the drive did not act on, and describes no property of the drive.
+
+        Args:
+            rows: Samples to average over, (N, J) bool.
+
+        Returns:
+            Mean variance that a fair comparison adds to the squared residual, (J,), N^2 m^2; 0 for
+            effects that add noise.
+        """
+        # Response of the prediction to further noise e of the encoders, with and without effects:
+        #     d = tau(q + e_q, dq + e_dq) - tau(q, dq);   result = mean(d_plain^2 - d^2), at least 0
+        if not self.effects:
+            return np.zeros(rows.shape[1])
+        plain, noisy = attrs.evolve(self, effects=()), self.samples.noisier
+        with_effects, without = (
+            attrs.evolve(one, samples=noisy).predict() - one.predict() for one in (self, plain)
+        )
+        removed = np.sum(without**2 - with_effects**2, axis=0, where=rows) / np.maximum(rows.sum(axis=0), 1)
+        variance: Array = np.maximum(removed, 0.0)
+        return variance
+
     def evaluate(self, gains: Array, values: Sequence[Array]) -> Array:
         """Predict the torque for a batch of parameter values.
 

@@ -32,7 +32,7 @@ from ..model.applied_effect import AppliedEffect
 from ..model.torque_model import Model
 from ..search.regressors import RegressorCandidate
 from ..statistics.baselines import explained_share, torque_variance
-from ..statistics.confidence import Intervals
+from ..statistics.confidence import InseparablePair, Intervals
 from ..statistics.criterion import (
     SIGNIFICANCE_LEVEL,
     WHITENESS_LEVEL,
@@ -101,6 +101,7 @@ class Outcome:
     Attributes:
         before: Plain EAM.
         after: Corrected model.
+        effects_alone: The best model without regressors of named signals.
         evidence: Evidence for and against effects.
         half_widths: 95 % confidence intervals of `after`.
         noise: Variance of the torque noise, (J,), N^2 m^2.
@@ -111,6 +112,7 @@ class Outcome:
 
     before: Model
     after: Model
+    effects_alone: Model
     evidence: Evidence
     half_widths: Intervals
     noise: Array
@@ -192,7 +194,9 @@ def _report(o: Outcome) -> dict[str, Any]:
         mses[name]["per_joint"] = [
             mean_square(errors[name][:, [j]], parts.report[:, [j]]) for j in range(len(samples.joints))
         ]
-    floor = float(np.average(o.noise, weights=np.maximum(parts.report.sum(axis=0), 1)))
+    # Where states are held, differences of rows overestimate the noise; it cannot exceed an error.
+    noise = float(np.average(o.noise, weights=np.maximum(parts.report.sum(axis=0), 1)))
+    floor = min(noise, mses["after"]["train_mse"] or noise)
     report = {
         "schema": SCHEMA,
         "joints": list(samples.joints),
@@ -210,6 +214,16 @@ def _report(o: Outcome) -> dict[str, Any]:
         "clocks": [_clock_entry(one) for one in o.clocks],
         "judged_rows": int(parts.report.any(axis=1).sum()),
         "effects": sorted(_effect_entries(o), key=lambda one: -one["heldout_gain"]),
+        "effects_alone": _effects_alone_entry(o) if o.regressors else None,
+        "inseparable": [
+            {
+                "names": list(one.names),
+                "joint": samples.joints[one.joint],
+                "correlation": one.correlation,
+                "conditional": one.conditional,
+            }
+            for one in o.half_widths.inseparable
+        ],
         "rejected": [
             {"name": name, "selecting_gain": gain, "reason": why} for name, gain, why in o.evidence.rejected
         ],
@@ -218,6 +232,7 @@ def _report(o: Outcome) -> dict[str, Any]:
             f"{name} is at its bound: its value and interval are not valid" for name in o.half_widths.at_bound
         ]
         + _unconfirmed_warnings(o)
+        + [_inseparable_warning(one, list(samples.joints)) for one in o.half_widths.inseparable]
         + _delay_spread_warnings(o.after)
         + _torque_limit_warnings(o),
     }
@@ -287,6 +302,15 @@ def _unconfirmed_warnings(o: Outcome) -> list[str]:
     ]
 
 
+def _inseparable_warning(pair: InseparablePair, joints: Sequence[str]) -> str:
+    """Warning about two parameters of which only a combination is known."""
+    first, second = pair.names
+    return (
+        f"{first} and {second} are not separable in these logs (correlation of the estimates {pair.correlation:.3f} on "
+        f"{joints[pair.joint]}): if {second} were known, the interval of {first} would be {pair.conditional:.2f} times as wide"
+    )
+
+
 def _delay_spread_warnings(model: Model) -> list[str]:
     """Warnings about delays that differ between joints: a running model has one pair."""
     spread = 1e3 * float(np.ptp(model.delays, axis=1).max())
@@ -319,6 +343,7 @@ def _gain_entries(o: Outcome) -> dict[str, Any]:
         **dict(zip(_DELTAS, zip(gain_deviations(model), halves, strict=True), strict=True)),
         "input_delay_ms": (1e3 * model.delays[0], 1e3 * widths.delays[0]),
         "output_delay_ms": (1e3 * model.delays[1], 1e3 * widths.delays[1]),
+        "total_delay_ms": (1e3 * model.delays.sum(axis=0), 1e3 * widths.total_delay),
     }
     for name, (values, half) in rows.items():
         least = -np.inf if name.startswith("delta") else 0.0
@@ -340,6 +365,15 @@ def _effect_entries(o: Outcome) -> list[dict[str, Any]]:
     if o.regressors:
         found.append(_regressors_entry(o, joints))
     return found
+
+
+def _effects_alone_entry(o: Outcome) -> dict[str, Any]:
+    """Entry of the report for the effects that explain most without regressors of named signals."""
+    model = o.effects_alone
+    return {
+        "names": list(dict.fromkeys(effect.candidate.name for effect in model.effects)),
+        "heldout_mse": mean_square(o.samples.tau - model.predictive().predict(), o.parts.report),
+    }
 
 
 def _regressors_entry(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:

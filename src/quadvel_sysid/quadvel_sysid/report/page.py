@@ -24,6 +24,7 @@ _EAM = (
     ("delta_kd", "ΔKd", "N m s/rad"),
     ("input_delay_ms", "input delay", "ms"),
     ("output_delay_ms", "output delay", "ms"),
+    ("total_delay_ms", "sum of both delays", "ms"),
 )
 """Gains and delays: key in report.json, title, unit."""
 

@@ -69,6 +69,11 @@ def _effects_text(report: Mapping[str, Any]) -> str:
     learned = any(one["name"] == LEARNED_RESIDUAL for one in effects)
     beyond = "the learned remainder" if learned else "the residual"
     more = f"; {beyond} depends on {', '.join(rest['depends_on'])}" if rest["depends_on"] else ""
+    alone = report["effects_alone"]
+    if alone and alone["names"]:
+        more += (
+            f"; without learned terms, {', '.join(alone['names'])} leave {alone['heldout_mse']:.3g} N^2 m^2"
+        )
     edges = rest["edges"]
     if edges["error"] >= _MIN_EDGE_ERROR_SHARE and edges["rows"] <= _MAX_EDGE_ROW_SHARE:
         more += (
@@ -126,13 +131,17 @@ def leave_one_out(reports: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         reports: Content of report.json of each fit, which reports on the log that was left out.
 
     Returns:
-        `before` and `after` (mean held-out errors, N^2 m^2), `shared` (effects that all fits found),
-        `differing` (effects that some found), and `logs`: for each log its errors, its clock, and
-        the model of the other logs.
+        `before` and `after` (mean held-out errors, N^2 m^2), `shared` (effects that all fits found,
+        in the corrected model or in the best one without learned terms), `differing` (effects that
+        some found), and `logs`: for each log its errors, its clock, and the model of the other logs.
     """
     named = [dict.fromkeys(one["name"] for one in report["effects"]) for report in reports]
-    every = dict.fromkeys(name for names in named for name in names)
-    shared = [name for name in every if all(name in each for each in named)]
+    found = [
+        {**each, **dict.fromkeys((report["effects_alone"] or {"names": ()})["names"])}
+        for each, report in zip(named, reports, strict=True)
+    ]
+    every = dict.fromkeys(name for names in found for name in names)
+    shared = [name for name in every if all(name in each for each in found)]
     values = ("delta_kp", "delta_kd", "input_delay_ms", "output_delay_ms")
     return {
         **{

@@ -18,7 +18,7 @@ from ..parallel import parallel_map
 from . import regressor_library
 from .context import Context
 from .effect_candidates.registry import effect_candidates
-from .fitted_model import FittedModel
+from .fitted_model import TRIAL_ITERATIONS, FittedModel
 from .regressors import RegressorCandidate
 from .screening import CandidateScreening, ScreenedCandidate, promising
 
@@ -101,18 +101,12 @@ class Candidates:
         return Fitted(self._fit_screened(best), len({one.key for one in every}))
 
     def _fit_screened(self, chosen: Sequence[ScreenedCandidate]) -> list[FittedModel]:
-        """Fit the candidates, and share the values of the best ones across joints."""
-        fitted = self._fit_parallel(lambda k: self._fit_candidate(chosen[k]), len(chosen))
-        fitted.sort(key=lambda one: one.criterion)
-        tried = self._options.shared_trials
-        best, others = fitted[:tried], fitted[tried:]
-        last = len(self._context.model.effects)
+        """Fit the candidates: a few steps of each, then whole fits of the best ones."""
+        begun = self._fit_parallel(lambda k: self._begin_fit(chosen[k]), len(chosen))
+        begun.sort(key=lambda one: one.criterion)
+        count = self._options.finished_fits
         return (
-            self._fit_parallel(
-                lambda k: self._evaluator.share_across_joints(self._refit_near_delays(best[k]), last).model,
-                len(best),
-            )
-            + others
+            self._fit_parallel(lambda k: self._finish_fit(begun[k]), min(count, len(begun))) + begun[count:]
         )
 
     def _refit_near_delays(self, fitted: FittedModel) -> FittedModel:
@@ -130,20 +124,26 @@ class Candidates:
     def _parallel_map(self, work: Callable[[int], Result], count: int) -> list[Result]:
         return parallel_map(work, count, self._evaluator.cores, self._context.samples)
 
-    def _fit_candidate(self, screened: ScreenedCandidate) -> Model:
-        """Fit a candidate on all joints, and on those where it is significant if that is better."""
+    def _begin_fit(self, screened: ScreenedCandidate) -> Model:
+        """A few steps of the fit of a candidate, from the better one of its starts."""
         evaluator, model, candidate = self._evaluator, screened.model, screened.candidate
-        near, last = model.with_delays(self._before.model.delays), len(model.effects) - 1
         if not self._options.second_starts:
-            return evaluator.restrict_joints(evaluator.fit(model), last).model
+            return evaluator.fit(model, TRIAL_ITERATIONS).model
+        near = model.with_delays(self._before.model.delays)
         if candidate.confounded_with_gain:
             # A value that all joints share is a change of a gain or a delay. One joint without the
             # effect makes the fit unique.
             rows = evaluator.parts.fit
             model, near = (_drop_weakest_joint(fit(start, rows, 4, delays=False)) for start in (model, near))
-        starts = [model, near] if candidate.shifts or candidate.confounded_with_gain else [model]
-        fitted = min((evaluator.fit(start) for start in starts), key=lambda one: one.criterion)
-        return evaluator.restrict_joints(fitted, last).model
+        starts = [model, near] if candidate.confounded_with_delays else [model]
+        begun = (evaluator.fit(start, TRIAL_ITERATIONS) for start in starts)
+        return min(begun, key=lambda one: one.criterion).model
+
+    def _finish_fit(self, begun: FittedModel) -> Model:
+        """The whole fit of a candidate: on the joints that need it, with values that joints share."""
+        evaluator, last = self._evaluator, len(self._context.model.effects)
+        fitted = self._refit_near_delays(evaluator.restrict_joints(evaluator.fit(begun.model), last))
+        return evaluator.share_across_joints(fitted, last).model
 
 
 def _refine(screened: ScreenedCandidate, screening: CandidateScreening) -> ScreenedCandidate:

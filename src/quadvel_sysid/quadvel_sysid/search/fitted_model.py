@@ -12,7 +12,7 @@ from quadvel_description.arrays import Array, Indices
 
 from ..data.split import DataSplit
 from ..model.applied_effect import AppliedEffect
-from ..model.fit import fit, fit_delay_profile
+from ..model.fit import MAX_ITERATIONS, fit, fit_delay_profile, fit_delay_splits
 from ..model.torque_model import Model
 from ..options import SEARCH_DEFAULTS, SearchOptions
 from ..parallel import parallel_map
@@ -26,6 +26,8 @@ from ..statistics.criterion import (
     whiteness_p_values,
 )
 
+TRIAL_ITERATIONS = 4
+"""Steps of a fit that show which of several models or starts is worth a whole fit."""
 _VARIANCE_FLOOR = 1e-12
 """Added to variances, N^2 m^2, for logs without noise."""
 
@@ -49,10 +51,13 @@ class FittedModel:
 
     @cached_property
     def selection_mse(self) -> Array:
-        """Mean squared error of each joint on the selection rows, (J,), N^2 m^2, as in `squared_error`."""
+        """Mean squared error of each joint on the selection rows, (J,), N^2 m^2, as in `squared_error`.
+
+        It includes the encoder noise that the effects average out.
+        """
         rows = self.evaluator.parts.select
         square = np.sum(self.residual**2 + self.model.averaged_noise(), axis=0, where=rows)
-        mse: Array = square / np.maximum(rows.sum(axis=0), 1)
+        mse: Array = square / np.maximum(rows.sum(axis=0), 1) + self.model.noise_averaged_by_effects(rows)
         return mse
 
     @cached_property
@@ -126,22 +131,24 @@ class ModelEvaluator:
     cores: int = 1
     options: SearchOptions = SEARCH_DEFAULTS
 
-    def fit(self, model: Model) -> FittedModel:
+    def fit(self, model: Model, iterations: int = MAX_ITERATIONS) -> FittedModel:
         """Fit a model to the fitted rows.
 
         Args:
             model: Start of the fit.
+            iterations: Maximum number of steps.
 
         Returns:
             The fitted model.
         """
-        return FittedModel(fit(model, self.parts.fit), self)
+        return FittedModel(fit(model, self.parts.fit, iterations), self)
 
-    def fit_each(self, models: Sequence[Model]) -> list[FittedModel]:
+    def fit_each(self, models: Sequence[Model], iterations: int = MAX_ITERATIONS) -> list[FittedModel]:
         """Fit several models of the same samples in parallel.
 
         Args:
             models: Starts of the fits.
+            iterations: Maximum number of steps of a fit.
 
         Returns:
             The fitted models, in the same order.
@@ -149,7 +156,7 @@ class ModelEvaluator:
         if not models:
             return []
         found = parallel_map(
-            lambda k: fit(models[k], self.parts.fit), len(models), self.cores, models[0].samples
+            lambda k: fit(models[k], self.parts.fit, iterations), len(models), self.cores, models[0].samples
         )
         return [FittedModel(one, self) for one in found]
 
@@ -167,6 +174,18 @@ class ModelEvaluator:
             FittedModel(fit_delay_profile(fitted.model, self.parts.fit, self.cores, self.options), self),
             key=lambda one: one.criterion,
         )
+
+    def refine_split(self, fitted: FittedModel) -> FittedModel:
+        """Fit a model again from other splits of its total delay into input and output delay.
+
+        Args:
+            fitted: A fitted model.
+
+        Returns:
+            `fitted` or the refitted model, whichever has the lower criterion.
+        """
+        other = FittedModel(fit_delay_splits(fitted.model, self.parts.fit), self)
+        return min(fitted, other, key=lambda one: one.criterion)
 
     def restrict_joints(self, fitted: FittedModel, index: int) -> FittedModel:
         """Restrict an effect to the joints where it is significant, if that lowers the criterion.
@@ -191,8 +210,8 @@ class ModelEvaluator:
         )
         if not needed.any() or (needed == effect.active).all():
             return fitted
-        if effect.candidate.shared_by_joints and needed.sum() == 1:
-            return fitted  # one joint cannot show a cause that all of them share
+        if needed.sum() == 1 and not effect.candidate.possible_on_one_joint:
+            return fitted
         fewer = self.fit(fitted.model.with_replaced_effect(index, attrs.evolve(effect, active=needed)))
         return min(fitted, fewer, key=lambda one: one.criterion)
 

@@ -33,6 +33,10 @@ _OUTPUT_DELAYS_S = (0.0005, 0.0025, 0.0045)
 """Grid of delays, s: changes of their sum, and output delays."""
 _ONE_GRID_POINT = (0.0,), (0.0025,)
 """The same, if only one other pair of delays is tried."""
+_FIRST_POINTS_S = (-0.004, 0.0, 0.004)
+"""Changes of the sum of delays, s, at which every effect is scored, at the middle output delay."""
+_PROFILED_EFFECTS = 16
+"""Best forms of effects after these points; only they are scored on the whole grid."""
 _MAX_DELAY_CHANGE_S = 0.0015
 """Range, s, of the linearisation along the delays around a grid point."""
 _ROWS_PER_JOINT = 1500
@@ -117,7 +121,7 @@ class CandidateScreening:
         self._grid = [context.model, *_delay_grid(context.model, *grid)]
 
     def screen_effects(self, candidates: Iterable[EffectCandidate]) -> list[ScreenedCandidate]:
-        """Score effects at every point of the grid of delays.
+        """Score effects on the grid of delays: all at a few points, the best of them at every point.
 
         Args:
             candidates: Effects, in all their forms.
@@ -126,15 +130,40 @@ class CandidateScreening:
             Each effect at its best grid point; effects without starting values are left out.
         """
         with_starts = [(one, table) for one in candidates if (table := self._start_values(one)) is not None]
+        first = self._first_points
+        found = self._screen_at(first, with_starts)
+        best = sorted(range(len(found)), key=lambda k: -found[k].score)[:_PROFILED_EFFECTS]
+        others = [k for k in range(len(self._grid)) if k not in first]
+        for k, one in zip(best, self._screen_at(others, [with_starts[k] for k in best]), strict=False):
+            found[k] = max(found[k], one, key=lambda each: each.score)
+        return found
+
+    @property
+    def _first_points(self) -> list[int]:
+        """Grid points at which every effect is scored, the delays of the model first."""
+        own, middle = self._context.model.delays, _OUTPUT_DELAYS_S[len(_OUTPUT_DELAYS_S) // 2]
+        totals = own.sum(axis=0) + np.array(_FIRST_POINTS_S)[:, None]
+        return [0] + [
+            k
+            for k, one in enumerate(self._grid)
+            if k
+            and (np.abs(one.delays.sum(axis=0) - totals) < 1e-6).all(axis=1).any()
+            and np.allclose(one.delays[1], middle)
+        ]
+
+    def _screen_at(
+        self, grid: Sequence[int], with_starts: Sequence[tuple[EffectCandidate, Array]]
+    ) -> list[ScreenedCandidate]:
+        """Each effect, with its starting values (S, P, J), at the best of some grid points."""
         with_memory = any(one.has_memory for one, _ in with_starts)
-        grid = self._points
+        points = self._points  # before the map, so that its processes share them
 
         def solve_at(k: int) -> list[tuple[Model, Array]]:
-            points = {False: grid[k], True: self._all_rows_point(k) if with_memory else grid[k]}
-            return [points[one.has_memory].best_start(one, table) for one, table in with_starts]
+            here = {False: points[k], True: self._all_rows_point(k) if with_memory else points[k]}
+            return [here[one.has_memory].best_start(one, table) for one, table in with_starts]
 
         # Profile over the delays: each effect is scored at its own best grid point.
-        found = parallel_map(solve_at, len(grid), self._cores, self._context.samples)
+        found = parallel_map(lambda k: solve_at(grid[k]), len(grid), self._cores, self._context.samples)
         return [
             max((self._scored(*solution) for solution in of_effect), key=lambda one: one.score)
             for of_effect in zip(*found, strict=True)

@@ -18,9 +18,14 @@ from quadvel_description.arrays import Array
 from ..model.applied_effect import AppliedEffect
 from ..model.effect_candidate import EffectCandidate
 from ..model.torque_model import Model
-from ..statistics.criterion import MIN_EFFECT_SIZE, SIGNIFICANCE_LEVEL
+from ..statistics.criterion import (
+    MIN_EFFECT_SIZE,
+    MIN_REMOVABLE_SHARE,
+    SIGNIFICANCE_LEVEL,
+    Comparison,
+)
 from .candidates import EFFECTS, REGRESSORS, Candidates
-from .fitted_model import FittedModel, ModelEvaluator, joint_groupings
+from .fitted_model import TRIAL_ITERATIONS, FittedModel, ModelEvaluator, joint_groupings
 from .regressors import RegressorCandidate
 
 MAX_EFFECTS = 5
@@ -94,6 +99,7 @@ class Search:
         """
         self.evaluator, self._options, self._on_progress = evaluator, evaluator.options, on_progress
         self._candidate_cache: dict[tuple[object, ...], Candidates] = {}
+        self._removable = np.zeros(len(evaluator.noise))  # of each joint, N^2 m^2
 
     def best(self, start: Model) -> SearchResult:
         """Find the model with the lowest criterion.
@@ -114,6 +120,7 @@ class Search:
         plain = self.evaluator.refine_delays(self.evaluator.fit(start))
         if plain.is_white:
             return SearchResult(plain, plain, record)
+        self._removable = np.maximum(plain.selection_mse - self.evaluator.noise, 0.0)
         # One effect that leaves white noise needs no comparison.
         effects = self.extend(plain, EFFECTS, record, most=1)
         if effects.is_white:
@@ -152,8 +159,7 @@ class Search:
             return ()
         comparison = best.compare_with(fitted)
         is_significant = comparison.p_value * found.tested_count < SIGNIFICANCE_LEVEL
-        is_large = float(np.max(comparison.relative_gain)) > MIN_EFFECT_SIZE
-        return best.last_effect.candidate.key if is_significant and is_large else ()
+        return best.last_effect.candidate.key if is_significant and self._is_large(comparison) else ()
 
     def prune(self, fitted: FittedModel) -> FittedModel:
         """Simplify a model: fewer effects and joints, special cases, shared values and gains.
@@ -279,6 +285,11 @@ class Search:
             )
         if relative_gain <= MIN_EFFECT_SIZE:
             return f"reduces the error of a joint by {100 * relative_gain:.1f} %, below {100 * MIN_EFFECT_SIZE:.0f} %"
+        if not self._is_large(comparison):
+            return (
+                f"reduces the error of each joint by less than {100 * MIN_REMOVABLE_SHARE:.0f} % of what the plain EAM leaves "
+                "above the noise"
+            )
         return "" if after.criterion < before.criterion else "its gain is below the cost of its parameters"
 
     def _candidates_of(self, before: FittedModel) -> Candidates:
@@ -298,7 +309,9 @@ class Search:
                 found.append(attrs.evolve(model, gain_groups=groups))
             if finer > len(np.unique(model.delay_groups)):
                 found.append(attrs.evolve(model, delay_groups=groups))
-        return self.evaluator.fit_each(found)
+        # Most finer groupings gain less than their parameters cost, which few steps show.
+        begun = self.evaluator.fit_each(found, iterations=TRIAL_ITERATIONS)
+        return self.evaluator.fit_each([one.model for one in begun if one.criterion < before.criterion])
 
     def eliminate(self, fitted: FittedModel, kept: int = 0) -> FittedModel:
         """Remove effects that are no longer significant (backward elimination).
@@ -311,26 +324,38 @@ class Search:
             The model with the necessary effects.
         """
         while self._options.elimination and len(fitted.model.effects) > max(kept, 1):
-            model = fitted.model
-            removable = range(len(model.effects) - kept)
-            reduced = min(
-                self.evaluator.fit_each([model.without_effect(k) for k in removable]),
-                key=lambda one: one.criterion,
-            )
+            removable = range(len(fitted.model.effects) - kept)
+            without = self.evaluator.fit_each([fitted.model.without_effect(k) for k in removable])
+            reduced = min(without, key=lambda one: one.criterion)
             if self._is_needed(reduced, fitted):
-                return fitted
+                # The split of the delays may have been fitted together with the effect.
+                confounded = [fitted.model.effects[k].candidate.confounded_with_delays for k in removable]
+                split = [self.evaluator.refine_split(without[k]) for k in np.flatnonzero(confounded)]
+                reduced = min([reduced, *split], key=lambda one: one.criterion)
+                if reduced not in split or self._is_needed(reduced, fitted):
+                    return fitted
             fitted = reduced
         return fitted
 
     def _is_needed(self, without: FittedModel, fitted: FittedModel) -> bool:
         """Whether the model is significantly better than the one without the effect."""
         comparison = fitted.compare_with(without)
-        relative_gain = float(np.max(comparison.relative_gain))
         return (
             fitted.criterion < without.criterion
-            and relative_gain > MIN_EFFECT_SIZE
+            and self._is_large(comparison)
             and comparison.p_value < SIGNIFICANCE_LEVEL
         )
+
+    def _is_large(self, comparison: Comparison) -> bool:
+        """Whether an effect reduces the error of some joint by more than the minimum effect size.
+
+        Where the form of a strong effect is not quite right, further effects make up for a per cent of
+        it, with any significance.
+        """
+        is_large = (comparison.relative_gain > MIN_EFFECT_SIZE) & (
+            comparison.joint_gain > MIN_REMOVABLE_SHARE * self._removable
+        )
+        return bool(is_large.any())
 
     def indistinguishable_effects(
         self, fitted: FittedModel, index: int, record: SearchRecord

@@ -3,18 +3,19 @@
 The wider of two covariances counts: that of white residuals, and the sandwich estimator on cluster
 sums over all joints (Liang and Zeger), which is valid for any correlation within a cluster. Gains
 and delays are among the unknowns. Where another form of an effect explains the log equally well, the
-interval contains its parameter values too.
+interval contains its parameter values too. Intervals grow with the error that no effect explains,
+relative to the noise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import attrs
 import numpy as np
 from scipy import stats
 
-from quadvel_description.arrays import Array, Bools
+from quadvel_description.arrays import Array, Bools, Indices
 
 from ..data.split import DataSplit
 from ..model.delays import delay_flatness
@@ -30,6 +31,28 @@ _SYSTEMATIC_FRACTION, _SYSTEMATIC_GAIN_FRACTION = 0.01, 0.005
 """Systematic error relative to an effect's value, and to a gain: motion samples are noisy."""
 _EQUIVALENT_ERROR_RATIO = 1.003
 """Ratio of squared errors below which another form of an effect explains the log equally well."""
+_INSEPARABLE_CORRELATION = 0.95
+"""Correlation of two estimates from which a log does not separate the parameters."""
+
+
+@attrs.frozen
+class InseparablePair:
+    """Two parameters that the log does not separate: an error of one is made up for by the other.
+
+    Attributes:
+        names: `delta_kp`, `delta_kd`, `input_delay`, `output_delay`, or `effect.parameter`.
+        joint: Index of the joint with the smallest correlation.
+        correlation: Correlation of the two estimates, -1 to 1.
+    """
+
+    names: tuple[str, str]
+    joint: int
+    correlation: float
+
+    @property
+    def conditional(self) -> float:
+        """Ratio of the first parameter's half width if the second one is known to that if not."""
+        return float(np.sqrt(max(1.0 - self.correlation**2, 0.0)))
 
 
 @attrs.frozen(eq=False)
@@ -40,21 +63,26 @@ class Intervals:
         gains: Gain ratios, (2, J).
         effects: Values of each effect, (P, J) each.
         delays: Input and output delay, (2, J), s.
+        total_delay: Sum of both delays, (J,), s.
         at_bound: Names of parameters that lie on a bound, whose intervals are not valid.
+        inseparable: Pairs of parameters that the log does not separate.
     """
 
     gains: Array
     effects: tuple[Array, ...]
     delays: Array
+    total_delay: Array
     at_bound: tuple[str, ...]
+    inseparable: tuple[InseparablePair, ...]
 
 
-def intervals(model: Model, parts: DataSplit, clock_offsets: Sequence[float] = ()) -> Intervals:
+def intervals(model: Model, parts: DataSplit, noise: Array, clock_offsets: Sequence[float] = ()) -> Intervals:
     """Compute confidence intervals of a model that was fitted to the rows that fit or select.
 
     Args:
         model: The fitted model.
         parts: Data split with the clusters.
+        noise: Variance of the torque noise, (J,), N^2 m^2.
         clock_offsets: Offsets of the recordings' commands, s, whose spread widens the interval of the
             input delay.
 
@@ -63,7 +91,11 @@ def intervals(model: Model, parts: DataSplit, clock_offsets: Sequence[float] = (
     """
     # Half width = random error + error of the effect's form + systematic error.
     rows = parts.fit_or_select
-    random_error = _random_half_widths(model, parts, rows)
+    covariance = _Covariance.of(model, parts, rows)
+    # What no effect explains can hide in any parameter: the random error grows with it.
+    error = squared_error(model, rows) / max(float((noise * rows.sum(axis=0)).sum()), 1e-300)
+    covariance = attrs.evolve(covariance, quantile=covariance.quantile * np.sqrt(max(error, 1.0)))
+    random_error = covariance.half_widths(np.eye(len(covariance.index)))
     effects, first = [], 2
     for index, effect in enumerate(model.effects):
         own = random_error[first : first + len(effect.values)]
@@ -80,43 +112,107 @@ def intervals(model: Model, parts: DataSplit, clock_offsets: Sequence[float] = (
     # A half width as large as the gain (or 1) means that any gain from 0 on is possible.
     size = np.abs(model.gains)
     gains = np.minimum(random_error[:2] + _SYSTEMATIC_GAIN_FRACTION * size, np.maximum(1.0, size))
-    # Input delays may be anywhere in the flat valley of the error.
-    delays = random_error[-2:] + _CLOCK_ERROR_S
-    delays[0] = np.maximum(delays[0], delay_flatness(model, rows) + _CLOCK_ERROR_S)
-    delays[0] += max(map(abs, clock_offsets), default=0.0)
-    delays = np.minimum(delays, MAX_DELAYS_S[:, None])
-    return Intervals(gains, tuple(effects), delays, parameters_at_bound(model))
+    # Input delays may be anywhere in the flat valley of the error, and so may the sum of both.
+    both = covariance.half_widths(np.eye(len(covariance.index))[-2:].sum(axis=0, keepdims=True))
+    delays = np.concatenate([random_error[-2:], both]) + _CLOCK_ERROR_S
+    flat = delay_flatness(model, rows) + _CLOCK_ERROR_S
+    delays[[0, 2]] = np.maximum(delays[[0, 2]], flat) + max(map(abs, clock_offsets), default=0.0)
+    delays = np.minimum(delays, np.append(MAX_DELAYS_S, MAX_DELAYS_S.sum())[:, None])
+    return Intervals(
+        gains,
+        tuple(effects),
+        delays[:2],
+        delays[2],
+        parameters_at_bound(model),
+        tuple(_inseparable(model, covariance)),
+    )
 
 
-def _random_half_widths(model: Model, parts: DataSplit, rows: Bools) -> Array:
-    """Half widths (A, J) from the parameter covariance; 0 for slots that are not fitted."""
-    unknowns = Unknowns.of(model)
-    hessian, _, slopes, residual = normal_equations(model, unknowns, rows)
-    degrees_of_freedom = max(int(rows.sum()) - unknowns.count, 1)
+@attrs.frozen(eq=False)
+class _Covariance:
+    """Covariance of the unknowns of a fit.
 
-    # Inverse of H = J'J, scaled to a unit diagonal because the units of the unknowns differ.
-    scale = np.sqrt(np.diagonal(hessian)) + 1e-12
-    inverse = np.linalg.pinv(hessian / np.outer(scale, scale), rcond=1e-10, hermitian=True)
-    inverse /= np.outer(scale, scale)
+    Attributes:
+        index: Unknown of slot a on joint j, (A, J); -1 where the slot is not fitted.
+        white: Covariance for white residuals, (K, K).
+        clustered: Cluster-robust covariance, (K, K).
+        quantile: Half width of the 95 % interval over the standard deviation.
+    """
 
-    # Two covariances of the form H^-1 M H^-1; the larger variance of each unknown counts:
-    #     white residuals:   M = sum_j s_j^2 J_j'J_j              (s_j^2: error variance of joint j)
-    #     cluster-robust:    M = sum_c g_c g_c',  g_c = sum over the rows of cluster c of J'r
-    noise = np.sum(residual**2, axis=0) / np.maximum(rows.sum(axis=0), 1)
-    white = unknowns.accumulate(noise[:, None, None] * (slopes @ slopes.transpose(0, 2, 1)))
-    sums = np.zeros((len(parts.cluster_starts), unknowns.count))
-    for j, moment in enumerate(slopes * residual.T[:, None]):  # (A, N)
-        used = unknowns.index[:, j] >= 0
-        sums[:, unknowns.index[used, j]] += parts.cluster_sums(moment[used].T)
-    clustered = sums.T @ sums
-    variance = np.maximum(*(np.diagonal(inverse @ inner @ inverse) for inner in (white, clustered)))
+    index: Indices
+    white: Array
+    clustered: Array
+    quantile: float
 
-    # Small-sample corrections: factor 1 + K / (n - K), and Student's t over the clusters.
-    cluster_count = int((parts.cluster_sums(rows.any(axis=1).astype(float)) > 0).sum())
-    joint_unknowns = int((unknowns.index >= 0).any(axis=1).sum())
-    variance = np.maximum(variance * (1.0 + unknowns.count / degrees_of_freedom), 0.0)
-    half = np.sqrt(variance) * stats.t.ppf(0.5 + CONFIDENCE_LEVEL / 2, max(cluster_count - joint_unknowns, 5))
-    return np.where(unknowns.index >= 0, half[unknowns.index], 0.0)
+    @classmethod
+    def of(cls, model: Model, parts: DataSplit, rows: Bools) -> _Covariance:
+        """Covariance of a model that was fitted to `rows`."""
+        unknowns = Unknowns.of(model)
+        hessian, _, slopes, residual = normal_equations(model, unknowns, rows)
+        degrees_of_freedom = max(int(rows.sum()) - unknowns.count, 1)
+
+        # Inverse of H = J'J, scaled to a unit diagonal because the units of the unknowns differ.
+        scale = np.sqrt(np.diagonal(hessian)) + 1e-12
+        inverse = np.linalg.pinv(hessian / np.outer(scale, scale), rcond=1e-10, hermitian=True)
+        inverse /= np.outer(scale, scale)
+
+        # Two covariances of the form H^-1 M H^-1:
+        #     white residuals:   M = sum_j s_j^2 J_j'J_j              (s_j^2: error variance of joint j)
+        #     cluster-robust:    M = sum_c g_c g_c',  g_c = sum over the rows of cluster c of J'r
+        noise = np.sum(residual**2, axis=0) / np.maximum(rows.sum(axis=0), 1)
+        white = unknowns.accumulate(noise[:, None, None] * (slopes @ slopes.transpose(0, 2, 1)))
+        sums = np.zeros((len(parts.cluster_starts), unknowns.count))
+        for j, moment in enumerate(slopes * residual.T[:, None]):  # (A, N)
+            used = unknowns.index[:, j] >= 0
+            sums[:, unknowns.index[used, j]] += parts.cluster_sums(moment[used].T)
+
+        # Small-sample corrections: factor 1 + K / (n - K), and Student's t over the clusters.
+        cluster_count = int((parts.cluster_sums(rows.any(axis=1).astype(float)) > 0).sum())
+        joint_unknowns = int((unknowns.index >= 0).any(axis=1).sum())
+        factor = 1.0 + unknowns.count / degrees_of_freedom
+        white, clustered = (factor * inverse @ inner @ inverse for inner in (white, sums.T @ sums))
+        quantile = stats.t.ppf(0.5 + CONFIDENCE_LEVEL / 2, max(cluster_count - joint_unknowns, 5))
+        return cls(unknowns.index, white, clustered, float(quantile))
+
+    def half_widths(self, sums: Array) -> Array:
+        """Half widths (S, J) of weighted sums (S, A) of the slots; slots that are not fitted are known."""
+        # Var(w'x) = w'C w on each joint; the larger one of both covariances counts.
+        fitted = self.index >= 0
+        weights = np.where(fitted.T[:, None], sums, 0.0)  # (J, S, A)
+        at = np.where(fitted, self.index, 0).T  # (J, A)
+        variance = [
+            np.einsum("jsa,jab,jsb->sj", weights, one[at[:, :, None], at[:, None, :]], weights)
+            for one in (self.white, self.clustered)
+        ]
+        half: Array = self.quantile * np.sqrt(np.maximum(np.maximum(*variance), 0.0))
+        return half
+
+    def correlations(self, joint: int) -> Array:
+        """Correlations (A, A) of the slots of a joint, by the white covariance; 0 where not fitted."""
+        fitted = self.index[:, joint] >= 0
+        at = np.where(fitted, self.index[:, joint], 0)
+        covariance = self.white[np.ix_(at, at)] * np.outer(fitted, fitted)
+        deviation = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+        found: Array = covariance / np.maximum(np.outer(deviation, deviation), 1e-300)
+        return found
+
+
+def _inseparable(model: Model, covariance: _Covariance) -> Iterator[InseparablePair]:
+    """Pairs of parameters that no joint separates, apart from pairs within one effect."""
+    names, owners = ["delta_kp", "delta_kd"], ["delta_kp", "delta_kd"]
+    for k, effect in enumerate(model.effects):
+        names += [f"{effect.candidate.name}.{name}" for name in effect.candidate.names]
+        owners += [str(k)] * len(effect.candidate.names)
+    names, owners = [*names, "input_delay", "output_delay"], [*owners, "input_delay", "output_delay"]
+    every = np.stack([covariance.correlations(j) for j in range(covariance.index.shape[1])])
+    fitted = covariance.index >= 0
+    for a in range(len(names)):
+        for b in range(a + 1, len(names)):
+            joints = np.flatnonzero(fitted[a] & fitted[b])
+            size = np.abs(every[joints, a, b])
+            if owners[a] != owners[b] and len(joints) and size.min() >= _INSEPARABLE_CORRELATION:
+                joint = int(joints[np.argmin(size)])
+                yield InseparablePair((names[a], names[b]), joint, float(every[joint, a, b]))
 
 
 def _form_error(model: Model, index: int, rows: Bools) -> Array:

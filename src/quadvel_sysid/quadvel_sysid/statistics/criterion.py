@@ -14,6 +14,8 @@ SIGNIFICANCE_LEVEL = 0.01
 """Significance level of an effect, after Bonferroni correction for the number of candidates."""
 MIN_EFFECT_SIZE = 0.03
 """Minimum error reduction of an effect on one joint, relative to the error that remains."""
+MIN_REMOVABLE_SHARE = 0.01
+"""Minimum error reduction of an effect on one joint, relative to what the plain EAM leaves above the noise."""
 PENALTY_PER_PARAMETER = 0.01
 """Minimum relative error reduction per parameter of a joint."""
 
@@ -45,6 +47,12 @@ class Comparison:
     def gain(self) -> float:
         """Mean reduction of the squared error over all rows, N^2 m^2."""
         return float(self.error_reduction.sum() / max(self.rows.sum(), 1))
+
+    @property
+    def joint_gain(self) -> Array:
+        """Mean reduction of each joint's squared error, (J,), N^2 m^2."""
+        gain: Array = self.error_reduction.sum(axis=0) / np.maximum(self.rows.sum(axis=0), 1)
+        return gain
 
     @property
     def relative_gain(self) -> Array:

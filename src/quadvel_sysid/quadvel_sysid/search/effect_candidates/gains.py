@@ -62,6 +62,7 @@ class SupplySagCandidate(EffectCandidate):
 
     effect: gains.SupplySag | gains.PowerSag
     motion = "hard accelerations of all joints together, with the supply voltage logged"
+    possible_on_one_joint = False  # all drives have the same supply
 
     @property
     @override
