@@ -62,7 +62,6 @@ PACKAGES = [path.parent for path in sorted(ROOT.glob("src/*/*/__init__.py"))] + 
 ]
 UNDOCUMENTED = (
     "src/quadvel_dds/quadvel_dds/rclpy*",  # the interface of rclpy, documented there
-    "training/quadvel_training/against_cusrl.py",  # it needs cusrl
 )
 apidoc_modules = [
     {

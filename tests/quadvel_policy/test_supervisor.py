@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rig import FORWARD, STILL, Rig, assert_damping
 
 from quadvel_description.robot import COMMAND_UPPER, LIE_Q, NOMINAL_Q, TORQUE_LIMIT, UPPER
 from quadvel_description.state import MODE_SERVO
@@ -20,6 +19,7 @@ from quadvel_policy.guards import GUARDS
 from quadvel_policy.guards.legs import EncoderInconsistent
 from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.transitions import MODES
+from tests.quadvel_policy.rig import FORWARD, STILL, Rig, assert_damping
 
 WITHOUT_ENCODERS = [guard for guard in GUARDS if guard is not EncoderInconsistent]
 

@@ -3,7 +3,6 @@
 import attrs
 import numpy as np
 import pytest
-from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import ActuatorModel
 from quadvel_sysid.data.plain_model import fit_eam
@@ -13,6 +12,7 @@ from quadvel_sysid.logs.log import Log
 from quadvel_sysid.model.delays import central_equivalent_delay, quantised_delays, running_delays
 from quadvel_sysid.model.fit import fit, fit_delay_profile, squared_error
 from quadvel_sysid.model.torque_model import Model
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters, record
 
 JOINTS = NAMES[:2]
 ONE = np.zeros(2, dtype=np.intp)

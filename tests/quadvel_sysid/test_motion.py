@@ -6,7 +6,6 @@ from pathlib import Path
 import attrs
 import numpy as np
 import pytest
-from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
 from quadvel_description.robot import NOMINAL_Q
@@ -18,6 +17,7 @@ from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
 from quadvel_sysid.options import IdentifyOptions
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters, record
 
 JOINTS = NAMES[:2]
 

@@ -2,10 +2,10 @@
 
 import attrs
 import pytest
-from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
 from quadvel_sysid.identify import identify
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters, record
 
 JOINTS = NAMES[:2]
 FRICTION = Effect("coulomb_friction", JOINTS, {"c": 0.5, "v_0": 0.05})

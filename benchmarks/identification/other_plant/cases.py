@@ -1,7 +1,7 @@
 """Cases of the second generator: a log, perhaps a second one of the same robot, and the truth.
 
 `make_case(kind, index, seed)` is reproducible. The truth has the form of the first generator's, so
-that `tests.identification.verdicts` scores both.
+that `benchmarks.identification.verdicts` scores both.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from benchmarks.identification.hidden.cases import Case
 from benchmarks.identification.other_plant.machine import TICK_S, Machine, Run, run
-from tests.identification.hidden.cases import Case
 
 Array = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from tests.identification import adapter, score, table
-from tests.identification.verdicts import score_report
+from benchmarks.identification import adapter, score, table
+from benchmarks.identification.verdicts import score_report
 
 
 def _entry(name, joints=("A_hip_joint",), others=(), **params):

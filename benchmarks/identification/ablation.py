@@ -1,9 +1,9 @@
 """Ablation study of the effect search: its score without each of its options, on the same logs.
 
-    python -m tests.identification.ablation --logs 2 --seed 912 --jobs 2 --out out/ablation [--switches nesting,elimination]
+    python -m benchmarks.identification.ablation --logs 2 --seed 912 --jobs 2 --out out/ablation [--switches nesting,elimination]
 
 Each switch turns one option off. An interrupted run continues where it stopped, as that of
-`tests.identification.score`. The comparison is paired: it counts the logs whose verdict changes.
+`benchmarks.identification.score`. The comparison is paired: it counts the logs whose verdict changes.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
+from benchmarks.identification.hidden.cases import GROUP_OF
+from benchmarks.identification.score import save_row, score_case
 from quadvel_sysid.options import IdentifyOptions, SearchOptions
-from tests.identification.hidden.cases import GROUP_OF
-from tests.identification.score import save_row, score_case
 
 BASELINE = "everything"
 

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.identification.hidden import worth
-from tests.identification.hidden.effect import Draw, Effect
-from tests.identification.hidden.known import KNOWN
-from tests.identification.hidden.motion import LEGS, Motion, joint_names, make_motion
-from tests.identification.hidden.outside import OUTSIDE
-from tests.identification.hidden.plant import Body, Drive, Trace, arrivals, simulate
+from benchmarks.identification.hidden import worth
+from benchmarks.identification.hidden.effect import Draw, Effect
+from benchmarks.identification.hidden.known import KNOWN
+from benchmarks.identification.hidden.motion import LEGS, Motion, joint_names, make_motion
+from benchmarks.identification.hidden.outside import OUTSIDE
+from benchmarks.identification.hidden.plant import Body, Drive, Trace, arrivals, simulate
 
 Array = NDArray[np.float64]
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from tests.identification import adapter
-from tests.identification.hidden.cases import make_case
-from tests.identification.verdicts import score_report
+from benchmarks.identification import adapter
+from benchmarks.identification.hidden.cases import make_case
+from benchmarks.identification.verdicts import score_report
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import attrs
 
+from benchmarks.identification.ablation import BASELINE, SWITCHES, options_without, table
 from quadvel_sysid.options import SEARCH_DEFAULTS, SearchOptions
-from tests.identification.ablation import BASELINE, SWITCHES, options_without, table
 
 
 def test_every_option_has_a_switch_that_turns_it_off() -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tests.identification.hidden.plant import State, Step, Trace
+from benchmarks.identification.hidden.plant import State, Step, Trace
 
 Maker = Callable[[State, int, float], Step]
 

@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from tests.identification.hidden.effect import Draw, Effect, smooth
-from tests.identification.hidden.plant import State, Step
+from benchmarks.identification.hidden.effect import Draw, Effect, smooth
+from benchmarks.identification.hidden.plant import State, Step
 
 
 def coulomb_friction(draw: Draw) -> Effect:

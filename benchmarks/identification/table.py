@@ -35,7 +35,7 @@ def markdown(rows: list[Row], seed: int) -> str:
     done = [row for row in rows if "error" not in row]
     parts = [
         "# Score of the identification on logs with an undeclared effect\n",
-        f"{len(rows)} logs, seed {seed}; made by `python -m tests.identification.score`, whose generator shares no code with"
+        f"{len(rows)} logs, seed {seed}; made by `python -m benchmarks.identification.score`, whose generator shares no code with"
         " the registry. Half of the logs of a kind lift feet (Eq. 9 of the paper, with varied rates and heights), half use"
         " mixed motions; the error of each effect is at least 0.3 of the torque noise. Errors are mean squares over held-out"
         " samples, as multiples of the true floor (torque noise, and encoder noise through the gains): median and 90 %"

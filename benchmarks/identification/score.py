@@ -1,7 +1,7 @@
 """Benchmark of the identification on logs with undeclared effects (blind test).
 
-    python -m tests.identification.score --logs 20 --jobs 2 --out out/identification_score [--kinds cogging,none] [--write]
-    python -m tests.identification.score --logs 4 --generator other --out out/other_score
+    python -m benchmarks.identification.score --logs 20 --jobs 2 --out out/identification_score [--kinds cogging,none] [--write]
+    python -m benchmarks.identification.score --logs 4 --generator other --out out/other_score
 
 The second generator (`benchmarks.identification.other_plant`) shares no code with the first one.
 An interrupted run continues where it stopped: the verdict of each log is a file under DIR/cases.
@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import subprocess
 import time
 import traceback
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -25,13 +24,15 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
+from benchmarks.identification import adapter, table
+from benchmarks.identification.hidden import cases as first_cases
 from benchmarks.identification.other_plant import cases as other_cases
+from benchmarks.identification.verdicts import score_report
+from benchmarks.provenance import ROOT, last_commit
 from quadvel_sysid.options import DEFAULTS, IdentifyOptions
-from tests.identification import adapter, table
-from tests.identification.hidden import cases as first_cases
-from tests.identification.verdicts import score_report
 
-ROOT = Path(__file__).parents[2]
+ENGINE = ("src/quadvel_actuator", "src/quadvel_sysid")
+"""Folders of the identification, whose last commit a row names."""
 PAGE = ROOT / "docs" / "results" / "identification_score.md"
 GENERATORS = {"first": first_cases, "other": other_cases}
 
@@ -75,25 +76,9 @@ def score_case(
     return {"name": case.name, **found, "truth": case.truth}
 
 
-def engine_commit() -> str:
-    """Return the last commit that touched the identification.
-
-    Returns:
-        Short hash, with `+` if its files differ from that commit.
-    """
-    tool = ("src/quadvel_actuator", "src/quadvel_sysid")
-    outputs = [
-        subprocess.run(
-            ["git", *call, "--", *tool], cwd=ROOT, capture_output=True, text=True, check=True
-        ).stdout
-        for call in (("log", "-1", "--format=%h"), ("status", "--porcelain"))
-    ]
-    return outputs[0].strip() + ("+" if outputs[1] else "")
-
-
 def _work(kind: str, index: int, seed: int, generator: str, path: Path) -> None:
     """Score one log into its file."""
-    save_row(score_case(kind, index, seed, generator=generator) | {"engine": engine_commit()}, path)
+    save_row(score_case(kind, index, seed, generator=generator) | {"engine": last_commit(*ENGINE)}, path)
 
 
 def save_row(row: dict[str, Any], path: Path) -> None:

@@ -35,6 +35,7 @@ class Case:
 
     @property
     def name(self) -> str:
+        """Name of the recording."""
         return f"{self.kind}_{self.strength}_{self.seed}"
 
 

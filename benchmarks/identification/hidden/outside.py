@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from tests.identification.hidden.effect import Draw, Effect, smooth
-from tests.identification.hidden.plant import State, Step
+from benchmarks.identification.hidden.effect import Draw, Effect, smooth
+from benchmarks.identification.hidden.plant import State, Step
 
 PAST = ["tau@history", "q_des@history", "q@history", "dq@history", "ddq@history"]
 SPEED = ["dq", "dq@history"]

@@ -20,11 +20,10 @@ from typing_extensions import override
 
 from quadvel_description import symmetry
 from quadvel_policy.observation import DEFAULT_OBSERVATION
-
-from . import constrained, dagger, networks
-from .constrained import ConstrainedConfig, ConstrainedRun
-from .networks import Gaussian, Mlp, Recurrent, torch_mirror
-from .ppo import Ppo, Rollout
+from quadvel_training import constrained, dagger, networks
+from quadvel_training.constrained import ConstrainedConfig, ConstrainedRun
+from quadvel_training.networks import Gaussian, Mlp, Recurrent, torch_mirror
+from quadvel_training.ppo import Ppo, Rollout
 
 try:
     import cusrl  # type: ignore[import-not-found,import-untyped,unused-ignore]

@@ -1,6 +1,6 @@
 """Margins of the log checks on valid logs, the basis of the constants of `logs.response`.
 
-    python -m tests.identification.limits [FOLDER of further logs, .npz]
+    python -m benchmarks.identification.limits [FOLDER of further logs, .npz]
 
 Evaluates two logs of every kind of the blind test, and those in FOLDER.
 """
@@ -13,11 +13,11 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from benchmarks.identification.hidden.cases import GROUP_OF, make_case
 from quadvel_sysid.logs.check_log import check_log
 from quadvel_sysid.logs.checks.response import MAX_LAG_S, Response, measure_response
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
-from tests.identification.hidden.cases import GROUP_OF, make_case
 
 SEED, INDICES = 77, (900, 901)
 SHARES = (0, 1, 5, 50, 95, 99, 100)

@@ -1,4 +1,4 @@
-"""Fuzzer of the packet decoders: `python -m quadvel_driver.fuzz --datagrams 10000000`. For developers.
+"""Fuzzer of the packet decoders: `python -m tests.quadvel_driver.fuzz --datagrams 10000000`. For developers.
 
 Both formats are tried: UDP packets of the AlienGo (`wire`) and DDS samples of the Go2
 (`unitree_dds.wire`). A fuzzer chooses bytes, from which three kinds of datagrams are made: raw bytes, packets with
@@ -25,9 +25,8 @@ from typing import Any
 import numpy as np
 
 from quadvel_description.state import JointCommand, RobotState
-
-from .board_state import BoardState, Button, Remote
-from .packets import WireError
+from quadvel_driver.board_state import BoardState, Button, Remote
+from quadvel_driver.packets import WireError
 
 RAW, CHANGED, VALID_CRC = range(3)
 HEADER_BYTES = 2  # bytes that select the kind of datagram and the packet
@@ -194,7 +193,7 @@ def fuzz_at_random(target: FuzzTarget, datagrams: int, seed: int = 0) -> None:
 
 def main() -> None:
     """Run the fuzzer; exit code 0 means that no decoder failed."""
-    parser = argparse.ArgumentParser(prog="python -m quadvel_driver.fuzz", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.quadvel_driver.fuzz", description=__doc__)
     parser.add_argument("--datagrams", type=int, default=1_000_000, help="how many; a million by default")
     parser.add_argument("--seed", type=int, default=1, help="of what is tried")
     arguments = parser.parse_args()

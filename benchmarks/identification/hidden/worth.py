@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.identification.hidden.plant import Trace
+from benchmarks.identification.hidden.plant import Trace
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """Blind suite of `quadvel why`: walks with hidden defects, and the share that the diagnosis names rightly.
 
-    python -m tests.why.score --suite 2 --out out/why_score [--kinds slipping,none] [--rounds 4]
+    python -m benchmarks.why.score --suite 2 --out out/why_score [--kinds slipping,none] [--rounds 4]
 
 Each round holds every kind at one strength and a fifth of sound walks. Recordings and answers lie in the folder, so
 an interrupted run continues. Delete the answers (*.answer.json) after a change of the diagnosis.
@@ -18,12 +18,12 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from benchmarks.why.cases import STRENGTHS, Case, all_cases, record
+from benchmarks.why.defects import ALSO_RIGHT
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import diagnose
 from quadvel_why.reading import read_run
 from quadvel_why.signals import Signals
-from tests.why.cases import STRENGTHS, Case, all_cases, record
-from tests.why.defects import ALSO_RIGHT
 
 EQUAL_TRACKING = 1.1
 """A walk whose tracking error is within this factor of the sound walk's shows no effect of its defect."""

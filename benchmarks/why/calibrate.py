@@ -1,6 +1,6 @@
 """Writes the limits of `quadvel why`: the largest number that each cause measures on healthy walks.
 
-    python -m tests.why.calibrate --walks 12 --out out/why_limits
+    python -m benchmarks.why.calibrate --walks 12 --out out/why_limits
 
 The walks have the seeds 900, 901, ... and the nominal plant; the blind suite has other seeds, and plants that vary.
 """
@@ -12,16 +12,16 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.why.walks import Defect, RecordedWalk, make_script
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import LIMITS_FILE
 from quadvel_why.links import CAUSES
 from quadvel_why.reading import read_run
 from quadvel_why.signals import Signals
-from tests.why.walks import Defect, RecordedWalk, make_script
 
 FIRST_SEED = 900
 WALK_S = 4.0
-HEAD = "# Largest numbers on healthy walks: python -m tests.why.calibrate\nhealthy:\n"
+HEAD = "# Largest numbers on healthy walks: python -m benchmarks.why.calibrate\nhealthy:\n"
 
 
 def main(

@@ -96,9 +96,11 @@ class Messages:
     rows: list[tuple[str, str, int, Any]] = attrs.field(factory=list)
 
     def add(self, topic: str, typename: str, ns: int, **fields: Any) -> None:
+        """Append a message of a topic at a time, ns."""
         self.rows.append((topic, typename, ns, STORE.types[typename](**fields)))
 
     def write(self, path: Path) -> Path:
+        """Write the messages to a recording and return its path."""
         file = RecordingFile(path)
         for topic, typename, ns, message in self.rows:
             data = bytes(STORE.serialize_cdr(message, typename))

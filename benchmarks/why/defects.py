@@ -12,6 +12,7 @@ from typing import Any
 import attrs
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from quadvel_actuator.parameters import ActuatorParameters, Effect
 from quadvel_description.arrays import Array
@@ -45,9 +46,11 @@ class JointOrder(Defect):
     order: list[int]
     both: bool
 
+    @override
     def reported(self, state: RobotState) -> RobotState:
         return _joints(state, lambda x: x[self.order], ("q", "dq", "tau")) if self.both else state
 
+    @override
     def received(self, command: JointCommand) -> JointCommand:
         where = np.argsort(self.order)
         return attrs.evolve(
@@ -62,9 +65,11 @@ class JointSign(Defect):
     sign: Array
     both: bool
 
+    @override
     def reported(self, state: RobotState) -> RobotState:
         return _joints(state, lambda x: x * self.sign, ("q", "dq", "tau")) if self.both else state
 
+    @override
     def received(self, command: JointCommand) -> JointCommand:
         return attrs.evolve(command, **{f: getattr(command, f) * self.sign for f in ("q", "dq", "tau")})
 
@@ -76,9 +81,11 @@ class JointOffset(Defect):
     offset: Array
     both: bool
 
+    @override
     def reported(self, state: RobotState) -> RobotState:
         return attrs.evolve(state, q=state.q + self.offset)
 
+    @override
     def received(self, command: JointCommand) -> JointCommand:
         return attrs.evolve(command, q=command.q - self.offset) if self.both else command
 
@@ -90,6 +97,7 @@ class JointScale(Defect):
     q: Array
     dq: Array
 
+    @override
     def reported(self, state: RobotState) -> RobotState:
         return attrs.evolve(state, q=state.q * self.q, dq=state.dq * self.dq)
 
@@ -101,6 +109,7 @@ class Gains(Defect):
     kp: float
     kd: float
 
+    @override
     def received(self, command: JointCommand) -> JointCommand:
         return attrs.evolve(command, kp=self.kp * command.kp, kd=self.kd * command.kd)
 
@@ -112,6 +121,7 @@ class Imu(Defect):
     quaternion: Callable[[Array], Array] = lambda x: x
     gyro: Callable[[Array, Array], Array] = lambda w, _: w
 
+    @override
     def reported(self, state: RobotState) -> RobotState:
         w = self.gyro(state.angular_velocity, state.quaternion)
         return attrs.evolve(state, quaternion=self.quaternion(state.quaternion), angular_velocity=w)
@@ -129,6 +139,7 @@ class _Wrapped:
     def prepare(self) -> None:
         pass
 
+    @override
     def step(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         return self.inner.step(observation)
 
@@ -139,6 +150,7 @@ class Observation(Defect):
 
     change: Callable[[NDArray[np.float32], InputLayout], NDArray[np.float32]]
 
+    @override
     def policy(self, policy: Policy) -> Policy:
         change = self.change
 
@@ -155,6 +167,7 @@ class ActionScale(Defect):
 
     factor: float
 
+    @override
     def policy(self, policy: Policy) -> Policy:
         changed = _Wrapped(policy)
         scale = tuple(self.factor * x for x in policy.metadata.action_scale)
@@ -168,6 +181,7 @@ class MemoryReset(Defect):
 
     every: int
 
+    @override
     def policy(self, policy: Policy) -> Policy:
         every = self.every
 
@@ -194,6 +208,7 @@ class MemoryKept(Defect):
     size: float
     seed: int
 
+    @override
     def policy(self, policy: Policy) -> Policy:
         size, seed = self.size, self.seed
 
@@ -214,6 +229,7 @@ class PolicyRate(Defect):
     every: int
     plant: dict[str, Any] = attrs.field(factory=lambda: {"watchdog": 0.1})
 
+    @override
     def answers(self, tick: int) -> bool:
         return tick % self.every == 0
 
@@ -226,6 +242,7 @@ class Jitter(Defect):
     rng: Rng
     plant: dict[str, Any] = attrs.field(factory=lambda: {"watchdog": 0.1})
 
+    @override
     def latency_ms(self) -> int:
         return int(self.rng.integers(0, self.longest_ms + 1))
 
@@ -238,6 +255,7 @@ class RepeatedStates(Defect):
     rng: Rng
     last: RobotState | None = None
 
+    @override
     def reported(self, state: RobotState) -> RobotState:
         if self.last is not None and state.time > 0.3 and self.rng.random() < self.share:
             return attrs.evolve(self.last, time=state.time, tick=state.tick)
@@ -253,6 +271,7 @@ class LostCommands(Defect):
     rng: Rng
     plant: dict[str, Any] = attrs.field(factory=lambda: {"watchdog": 0.1})
 
+    @override
     def received(self, command: JointCommand) -> JointCommand | None:
         return None if self.rng.random() < self.share else command
 
@@ -264,6 +283,7 @@ class Delay(Defect):
     ms: int
     plant: dict[str, Any] = attrs.field(factory=lambda: {"watchdog": 0.1})
 
+    @override
     def transport_ms(self) -> int:
         return self.ms
 
@@ -278,6 +298,7 @@ class Encoder(Defect):
     ticks: int
     last: tuple[float, float] = (0.0, 0.0)
 
+    @override
     def reported(self, state: RobotState) -> RobotState:
         phase = (state.tick // TICK_MS + 7 * self.joint) % self.every
         if state.time > 0.3 and phase < self.ticks:
@@ -297,6 +318,7 @@ class Estimate(Defect):
     lag: int = 0
     past: list[Array] = attrs.field(factory=list)
 
+    @override
     def estimate(self, velocity: Array) -> Array:
         self.past.append(self.scale * velocity + self.bias)
         return self.past[max(len(self.past) - 1 - self.lag, 0)]
@@ -312,13 +334,16 @@ class Plant(Defect):
     after: float = 0.9
     degrees: Array | None = None
 
+    @override
     def at(self, simulator: Simulator, time: float) -> None:
         if self.jammed is not None and time >= self.after:
             simulator.model.dof_frictionloss[6 + self.jammed[0]] = self.jammed[1]
 
+    @override
     def velocities(self, wanted: Velocity) -> Velocity:
         return wanted if self.fastest is None else (self.fastest, 0.0, 0.0)
 
+    @override
     def temperatures(self, time: float) -> Array:
         usual = super().temperatures(time)
         return usual if self.degrees is None else self.degrees + usual - 42.0
@@ -331,6 +356,7 @@ class WeakDrive(Defect):
     joint: int
     share: float
 
+    @override
     def received(self, command: JointCommand) -> JointCommand:
         factor = np.ones(12)
         factor[self.joint] = self.share

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.identification import hidden
-from tests.identification.hidden.cases import GROUP_OF, make_case
-from tests.identification.hidden.motion import STANCE, foot_height, ground_torque, leg_angles
-from tests.identification.hidden.plant import arrivals
+from benchmarks.identification import hidden
+from benchmarks.identification.hidden.cases import GROUP_OF, make_case
+from benchmarks.identification.hidden.motion import STANCE, foot_height, ground_torque, leg_angles
+from benchmarks.identification.hidden.plant import arrivals
 
 SOURCES = sorted(Path(hidden.__file__).parent.glob("*.py"))
 
