@@ -25,8 +25,7 @@ from rich.console import Console
 from rich.progress import track
 
 from benchmarks.identification import adapter, table
-from benchmarks.identification.hidden import cases as first_cases
-from benchmarks.identification.other_plant import cases as other_cases
+from benchmarks.identification.contest import GENERATORS
 from benchmarks.identification.verdicts import score_report
 from benchmarks.provenance import ROOT, last_commit
 from quadvel_sysid.options import DEFAULTS, IdentifyOptions
@@ -34,7 +33,6 @@ from quadvel_sysid.options import DEFAULTS, IdentifyOptions
 ENGINE = ("src/quadvel_actuator", "src/quadvel_sysid")
 """Folders of the identification, whose last commit a row names."""
 PAGE = ROOT / "docs" / "results" / "identification_score.md"
-GENERATORS = {"first": first_cases, "other": other_cases}
 
 
 def score_case(

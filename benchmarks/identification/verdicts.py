@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -57,9 +58,9 @@ def score_report(report: Report, truth: Truth) -> dict[str, Any]:
         "joints": len(truth["joints"]),
         "effects": true_names,
         "named": [effect["name"] for effect in effects],
-        "verdict": _VERDICTS[truth["group"]](report, truth),
+        "verdict": naming_verdict(report, truth),
         "extra": [e["name"] for e in effects if not any(_names_effect(e, true) for true in truth["effects"])],
-        "right_joints": _right_joints(report, truth),
+        "right_joints": named_joints_are_right(report, truth),
         "before": before,
         "after": after,
         "floor": truth["floor"],
@@ -140,14 +141,35 @@ def _table_4(report: Report, truth: Truth) -> str:
 _VERDICTS = {"alone": _alone, "together": _together, "none": _none, "outside": _outside, "table 4": _table_4}
 
 
+def naming_verdict(report: Report, truth: Truth) -> str:
+    """Compare the names in a report with those of the truth.
+
+    Args:
+        report: Content of report.json: `effects` and `unexplained`; for `table 4` also `before`.
+        truth: Ground truth from the generator.
+
+    Returns:
+        `right`, or what is wrong.
+    """
+    return _VERDICTS[truth["group"]](report, truth)
+
+
 def _all_signals(report: Report, truth: Truth) -> bool:
     """Whether the report names a signal of each part of an effect outside the registry."""
     named = set(report["unexplained"]["depends_on"])
     return all(named & set(names) for true in truth["effects"] for names in true["signals"].get("all", []))
 
 
-def _right_joints(report: Report, truth: Truth) -> bool:
-    """Whether every true effect is reported on its own joints, and on all where it is visible."""
+def named_joints_are_right(report: Report, truth: Truth) -> bool:
+    """Compare the joints of named effects with those of the truth.
+
+    Args:
+        report: Content of report.json: `effects` and `after`.
+        truth: Ground truth from the generator.
+
+    Returns:
+        Whether every true effect is reported on its own joints, and on all where it is visible.
+    """
     after = dict(zip(report.get("joints", ()), report["after"].get("per_joint", ()), strict=True))
     for true in truth["effects"]:
         on = {joint for entry in report["effects"] if _names_effect(entry, true) for joint in entry["joints"]}
@@ -157,30 +179,56 @@ def _right_joints(report: Report, truth: Truth) -> bool:
     return True
 
 
-def _intervals(effects: list[dict[str, Any]], truth: Truth) -> list[dict[str, Any]]:
-    """The 95 % intervals of correctly named effects' parameters, next to the true values."""
-    found = []
+def parameter_errors(effects: list[dict[str, Any]], truth: Truth) -> list[float]:
+    """Compare the parameters of correctly named effects with the true ones.
+
+    Args:
+        effects: Named effects of a report.
+        truth: Ground truth from the generator.
+
+    Returns:
+        Relative error of each parameter, the mean over its joints if it has a value for each.
+    """
+    return [
+        float(np.mean(np.abs(unit * np.atleast_1d(given["value"]) / value - 1.0)))
+        for _, value, given, unit in _named_parameters(effects, truth)
+        if value
+    ]
+
+
+def _named_parameters(
+    effects: list[dict[str, Any]], truth: Truth
+) -> Iterator[tuple[str, float, dict[str, Any], float]]:
+    """Yield effect and parameter, true value, entry of the report and its unit in SI units."""
     for true in truth["effects"]:
         for entry in effects:
             if entry["name"] != true["name"] or not set(entry["joints"]) <= set(true["joints"]):
                 continue
             for name, value in true["params"].items():
-                given = next(
-                    (entry["params"][a] for a in ALIASES.get(name, (name,)) if a in entry["params"]), None
-                )
-                if given is not None and given.get("ci95"):
-                    unit = UNITS.get(given.get("unit", ""), 1.0)
-                    values, edges = np.atleast_1d(given["value"]), np.atleast_2d(given["ci95"])
-                    for number, (low, high) in zip(unit * values, unit * edges, strict=True):
-                        found.append(
-                            {
-                                "effect": true["name"],
-                                "param": name,
-                                "truth": value,
-                                "value": float(number),
-                                "low": float(low),
-                                "high": float(high),
-                                "covered": bool(low <= value <= high),
-                            }
-                        )
+                for alias in ALIASES.get(name, (name,)):
+                    if alias in entry["params"]:
+                        given = entry["params"][alias]
+                        yield f"{true['name']}/{name}", value, given, UNITS.get(given.get("unit", ""), 1.0)
+                        break
+
+
+def _intervals(effects: list[dict[str, Any]], truth: Truth) -> list[dict[str, Any]]:
+    """The 95 % intervals of correctly named effects' parameters, next to the true values."""
+    found = []
+    for name, value, given, unit in _named_parameters(effects, truth):
+        if not given.get("ci95"):
+            continue
+        values, edges = np.atleast_1d(given["value"]), np.atleast_2d(given["ci95"])
+        for number, (low, high) in zip(unit * values, unit * edges, strict=True):
+            found.append(
+                {
+                    "effect": name.partition("/")[0],
+                    "param": name.partition("/")[2],
+                    "truth": value,
+                    "value": float(number),
+                    "low": float(low),
+                    "high": float(high),
+                    "covered": bool(low <= value <= high),
+                }
+            )
     return found
