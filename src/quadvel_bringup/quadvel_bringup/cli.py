@@ -216,20 +216,28 @@ def begin(
 
 
 @app.command(rich_help_panel=ROBOT)
-def doctor() -> None:
+def doctor(
+    report: Annotated[
+        bool, typer.Option("--report", help="Print a text for a bug report, with versions and system.")
+    ] = False,
+) -> None:
     """Check what is installed on this machine and what it can run.
 
     \b
     For example:
       quadvel doctor
+      quadvel doctor --report > report.md
     """
-    from .doctor import abilities, examine
+    from . import doctor
 
+    if report:
+        print(doctor.report([*doctor.examine()]))
+        return
     findings = []
-    for finding in examine():
+    for finding in doctor.examine():
         findings.append(finding)
         print(f"{'ok  ' if finding.good else 'note'} {finding.subject:12} {finding.text}", flush=True)
-    for ability, possible in abilities(findings):
+    for ability, possible in doctor.abilities(findings):
         print(f"{'can' if possible else 'cannot'} run {ability}")
 
 
