@@ -226,7 +226,7 @@ def doctor(
     \b
     For example:
       quadvel doctor
-      quadvel doctor --report > report.md
+      quadvel doctor --report
     """
     from . import doctor
 
