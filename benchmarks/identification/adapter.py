@@ -22,4 +22,4 @@ def identify(logs: list[Path], holdout: list[Path], options: IdentifyOptions = D
     from quadvel_sysid.identify import identify as run
     from quadvel_sysid.logs.read_log import read_log
 
-    return run([read_log(path) for path in logs], [read_log(path) for path in holdout], options).report
+    return dict(run([read_log(path) for path in logs], [read_log(path) for path in holdout], options).report)

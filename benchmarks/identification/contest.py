@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.identification.hidden import cases as first_cases
 from benchmarks.identification.hidden.cases import Case
 from benchmarks.identification.other_plant import cases as other_cases
-from quadvel_description.arrays import Array, Bools
+from quadvel_description.arrays import Bools
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.logs.read_log import read_log
 
@@ -110,8 +110,8 @@ def read_shared(path: Path) -> SharedLog:
         The log.
     """
     with np.load(path, allow_pickle=False) as file:
-        arrays: dict[str, Array] = dict(file)
-    known = np.isfinite(arrays["tau"]).all(axis=1)
+        arrays: dict[str, Any] = dict(file)
+    known: Bools = np.isfinite(arrays["tau"]).all(axis=1)
     arrays["tau"] = np.nan_to_num(arrays["tau"], nan=0.0)
     with TemporaryDirectory() as folder:
         filled = Path(folder) / path.name

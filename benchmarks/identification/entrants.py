@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.identification.contest import SharedLog
 from quadvel_actuator import ActuatorModel, ActuatorParameters
-from quadvel_description.arrays import Array
+from quadvel_description.arrays import Array, Bools, Floats
 from quadvel_sysid.data.plain_model import fit_eam
 from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.identify import identify
@@ -42,7 +42,7 @@ class Answer:
         depends_on: Signals that an effect without a name depends on, as in report.json.
     """
 
-    torque: Array
+    torque: Floats
     effects: list[dict[str, Any]] = attrs.Factory(list)
     depends_on: list[str] = attrs.Factory(list)
 
@@ -86,7 +86,7 @@ def modelled_torque(parameters: ActuatorParameters, log: Log) -> Array:
     return _interpolated(log.t, times, torque)
 
 
-def _interpolated(at: Array, t: Array, values: Array) -> Array:
+def _interpolated(at: Floats, t: Floats, values: Floats) -> Array:
     """Columns of (N, J) values at other times."""
     return np.stack([np.interp(at, t, column) for column in values.T], axis=1)
 
@@ -121,31 +121,46 @@ def friction_pd(shared: SharedLog) -> Answer:
     viscous friction b cannot be told from kd, so that only Coulomb friction is named.
     """
     log, known = shared.log, shared.known
+    laws = [_friction_law(log, j, known) for j in range(len(log.joints))]
+    sizes = {joint: law.friction for joint, law in zip(log.joints, laws, strict=True) if law.friction}
+    effect: dict[str, Any] = {
+        "name": "coulomb_friction",
+        "joints": list(sizes),
+        "params": {"c": {"value": list(sizes.values())}},
+        "indistinguishable": [],
+    }
+    torque = np.stack([law.torque for law in laws], axis=1)
+    return Answer(torque[~known], [effect] if sizes else [])
+
+
+@attrs.frozen(eq=False)
+class _FrictionLaw:
+    """PD law with friction of one joint: its torque (N,), N m, and Coulomb friction, 0 if none is seen."""
+
+    torque: Floats
+    friction: float
+    error: float
+
+
+def _friction_law(log: Log, j: int, known: Bools) -> _FrictionLaw:
+    """Law of joint `j` with the best delay of the command, fitted to the known rows."""
     assert log.tau is not None
-    columns, named, sizes = [], [], []
-    for j, joint in enumerate(log.joints):
-        sign = np.tanh(log.dq[:, j] / FRICTION_WIDTH_RAD_S)
-        best = None
-        for delay in np.arange(0.0, MAX_DELAY_S + LAG_STEP_S / 2, LAG_STEP_S):
-            target = log.q_des[log.command_rows(log.t - delay), j]
-            signals = np.stack([target, log.q[:, j], log.dq[:, j], np.ones_like(sign), sign], axis=1)
-            fits = [_least_squares(signals[:, :count], log.tau[:, j], known) for count in (4, 5)]
-            if best is None or fits[1][1] < best[1][1]:
-                best = (*fits, signals)
-        assert best is not None
-        (_, without), (weights, error), signals = best
-        columns.append(signals @ weights)
-        if without - error > FRICTION_SHARE * without and weights[-1] < 0.0:
-            named.append(joint)
-            sizes.append(-float(weights[-1]))
-    effect = {"name": "coulomb_friction", "joints": named, "params": {"c": {"value": sizes}}}
-    effects = [{**effect, "indistinguishable": []}] if named else []
-    return Answer(np.stack(columns, axis=1)[~known], effects)
+    tau, sign = log.tau[:, j], np.tanh(log.dq[:, j] / FRICTION_WIDTH_RAD_S)
+    laws = []
+    for delay in np.arange(0.0, MAX_DELAY_S + LAG_STEP_S / 2, LAG_STEP_S):
+        target = log.q_des[log.command_rows(log.t - delay), j]
+        signals = np.stack([target, log.q[:, j], log.dq[:, j], np.ones_like(sign), sign], axis=1)
+        _, without = _least_squares(signals[:, :-1], tau, known)
+        weights, error = _least_squares(signals, tau, known)
+        friction = max(-float(weights[-1]), 0.0)
+        seen = without - error > FRICTION_SHARE * without
+        laws.append(_FrictionLaw(signals @ weights, friction if seen else 0.0, error))
+    return min(laws, key=lambda law: law.error)
 
 
-def _least_squares(signals: Array, tau: Array, rows: Array) -> tuple[Array, float]:
+def _least_squares(signals: Floats, tau: Floats, rows: Bools) -> tuple[Floats, float]:
     """Weights of a linear regression on some rows, and its mean squared error there."""
-    weights = np.linalg.lstsq(signals[rows], tau[rows], rcond=None)[0]
+    weights: Floats = np.linalg.lstsq(signals[rows], tau[rows], rcond=None)[0]
     return weights, float(np.mean((tau[rows] - signals[rows] @ weights) ** 2))
 
 

@@ -139,7 +139,6 @@ class _Wrapped:
     def prepare(self) -> None:
         pass
 
-    @override
     def step(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         return self.inner.step(observation)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +42,7 @@ class Effect:
     skew: tuple[str, float] | None = None
     temperature: Callable[[np.ndarray], np.ndarray] | None = None
     voltage: list[float] | None = None
-    signals: dict[str, list] = field(default_factory=dict)
+    signals: dict[str, list[Any]] = field(default_factory=dict)
     also: tuple[str, ...] = ()
 
 

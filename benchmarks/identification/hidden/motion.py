@@ -163,7 +163,7 @@ def make_motion(
     rng: np.random.Generator, kind: str, legs: tuple[str, ...], dt: float, duration: float, kp: float
 ) -> Motion:
     """`kind` is "lifting" (Eq. 9, varied), "eq9" (as the paper has it) or "mixed"."""
-    time = np.arange(round(duration / dt)) * dt
+    time = np.arange(round(duration / dt), dtype=np.float64) * dt
     parts = [_leg_motion(rng, kind, time, first=0.0 if leg in ("FR", "RL") else 2.0) for leg in legs]
     angles = np.concatenate([angle for angle, _ in parts], axis=1)
     load = np.concatenate([ground_torque(angle, force) for angle, force in parts], axis=1)

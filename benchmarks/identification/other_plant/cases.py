@@ -256,7 +256,8 @@ def _log(
 ) -> tuple[dict[str, Any], float]:
     """Arrays of a log, and the error (N^2 m^2) of the true model on it."""
     rows = np.arange(round(0.05 / TICK_S), len(made.q), round(1.0 / rate / TICK_S))
-    true_t, shape = rows * TICK_S, (len(rows), made.q.shape[1])
+    true_t: Array = (rows * TICK_S).astype(np.float64)
+    shape = len(rows), made.q.shape[1]
     style = str(rng.choice(STAMPS, p=(0.6, 0.3, 0.1)))
     t = _stamps(true_t, style, rate, rng)
     clock = float(rng.uniform(-0.002, 0.002))  # of this recording
