@@ -10,6 +10,9 @@ PY := $(VENV)/bin/python
 # A second environment, with ROS 2's own rclpy: see ros_ws/wheels.
 ROS_VENV := .venv-ros
 ROS_PY := $(ROS_VENV)/bin/python
+# What draws the diagrams of the site. The site serves it itself, so that no page loads code of another host.
+MERMAID := out/mermaid
+MERMAID_VERSION := 11.12.1
 APT := on Debian 12 and Ubuntu 24.04: sudo apt install
 
 # The lock file sets the versions of all installs. A stamp file in .venv marks an installed set.
@@ -54,7 +57,7 @@ format: $(VENV)/.lint  ## format the code with ruff and apply its automatic fixe
 	$(VENV)/bin/ruff check --fix
 	$(VENV)/bin/ruff format
 
-docs: $(VENV)/.docs  ## build the site, and run its tutorials; results in out/docs
+docs: $(VENV)/.docs $(MERMAID)/.fetched  ## build the site, and run its tutorials; results in out/docs
 	$(PY) -m sphinx --builder html --fail-on-warning --keep-going docs out/docs
 
 pictures: $(VENV)/.test  ## take the pictures of the documents again; needs an idle machine
@@ -102,6 +105,15 @@ $(VENV)/.test: $(VENV)/.run
 
 $(VENV)/.docs: $(VENV)/.run
 	$(PY) $(INSTALL) '.[eval,view,docs]'
+	@touch $@
+
+$(MERMAID)/.fetched: Makefile
+	@command -v npm >/dev/null || { echo "the diagrams of the site need npm; $(APT) npm" >&2; exit 1; }
+	rm -rf $(MERMAID) && mkdir -p $(MERMAID)
+	cd $(MERMAID) && npm pack --silent mermaid@$(MERMAID_VERSION)
+	tar --extract --gzip --file $(MERMAID)/mermaid-$(MERMAID_VERSION).tgz --directory $(MERMAID) --strip-components 1 \
+	    --exclude '*.map' package/LICENSE package/dist/mermaid.esm.min.mjs package/dist/chunks/mermaid.esm.min
+	rm $(MERMAID)/mermaid-$(MERMAID_VERSION).tgz
 	@touch $@
 
 # The wheels are only for x86-64, and our interfaces are compiled: both are checked before the installation.

@@ -62,7 +62,6 @@ PACKAGES = [path.parent for path in sorted(ROOT.glob("src/*/*/__init__.py"))] + 
 ]
 UNDOCUMENTED = (
     "src/quadvel_dds/quadvel_dds/rclpy*",  # the interface of rclpy, documented there
-    "training/quadvel_training/against_cusrl.py",  # it needs cusrl
 )
 apidoc_modules = [
     {
@@ -98,7 +97,9 @@ html_theme_options = {
     "footer_end": [],
     "navigation_with_keys": False,
 }
-html_static_path = ["_static"]
+html_static_path = ["_static", str(ROOT / "out" / "mermaid")]
+# `make docs` fetches what draws the diagrams, and the site serves it.
+mermaid_use_local = "dist/mermaid.esm.min.mjs"
 html_css_files = ["site.css"]
 html_show_sourcelink = False
 html_copy_source = False

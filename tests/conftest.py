@@ -95,14 +95,14 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 @pytest.fixture(autouse=True)
 def nothing_left_running() -> Iterator[None]:
     """Fails a test that leaves processes behind, and ends them. What wider fixtures started may stay."""
-    before = _marked()
+    before = _processes()
     yield
     until = time.monotonic() + 10.0
-    while (left := _marked().items() - before.items()) and time.monotonic() < until:
+    while (left := _marked(_processes() - before)) and time.monotonic() < until:
         time.sleep(0.05)
-    for pid, _ in left:
-        os.kill(pid, signal.SIGKILL)
-    assert not left, f"left running: {', '.join(sorted(text for _, text in left))}"
+    for pid in left:
+        os.kill(int(pid), signal.SIGKILL)
+    assert not left, f"left running: {', '.join(sorted(left.values()))}"
 
 
 @pytest.fixture(autouse=True)
@@ -138,15 +138,21 @@ def signals_as_before() -> Iterator[None]:
     signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def _marked() -> dict[int, str]:
-    """Command lines, by process id, of the processes that this one started, their children included."""
+def _processes() -> set[str]:
+    """The ids of all processes."""
+    return {name for name in os.listdir("/proc") if name.isdecimal()}
+
+
+def _marked(processes: set[str]) -> dict[str, str]:
+    """Command lines, by process id, of those that this process started, their children included."""
     found = {}
-    for folder in Path("/proc").glob("[0-9]*"):
+    for pid in processes:
+        folder = Path("/proc", pid)
         try:
             environment = (folder / "environ").read_bytes().split(b"\0")
             text = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
         except OSError:  # it has ended meanwhile, or is not ours to look at
             continue
         if MARK.encode() in environment and text and not any(helper in text for helper in HELPERS):
-            found[int(folder.name)] = text
+            found[pid] = text
     return found

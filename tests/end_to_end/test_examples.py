@@ -87,6 +87,7 @@ NODES = [
     Step("quadvel run follow_planner --ros-args -p laser_x:=0.25 -p side:=left", served=True),
     Step("quadvel run trajectory_planner --ros-args -p file:=eight -p closed_loop:=true", served=True),
     Step("quadvel doctor"),
+    Step("quadvel doctor --report"),
 ]
 SESSIONS = {"robot": ROBOT, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
 
@@ -164,6 +165,8 @@ LEFT_OUT_KINDS = {
     r"\.venv/bin/pytest .*": "these are the tests",
     r"python -m quadvel_training (?!--help).*": "minutes to hours; tests/training runs each stage for some steps",
     r"torchrun .*": "the same",
+    r"python -m benchmarks\.(tracking|identification) (enter|judge|publish|table).*": "minutes; tests/benchmarks runs parts",
+    r"pixi run .*": "needs pixi and the network",
     r"mkdir -p out/checkpoints .*": "takes a checkpoint out of the history",
     r"((driver|controller|command_mux|ros__parameters):|(stick_velocity|max_tilt|max_velocity): .*)": "a part of a parameter "
     "file; test_yaml_examples.py loads it",

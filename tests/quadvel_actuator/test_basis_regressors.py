@@ -5,13 +5,13 @@ from types import SimpleNamespace
 import attrs
 import numpy as np
 import pytest
-from simulated_joints import NAMES, parameters
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
 from quadvel_actuator.effects.basis_regressors import BasisRegressor
 from quadvel_actuator.effects.regressor_entries import load_regressor
 from quadvel_actuator.effects.shapes import Curve, Filter, Lag, Resonance, Wave
 from tests.helpers.robots import ALIENGO
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters
 
 JOINTS = NAMES[:3]
 DT = 0.001

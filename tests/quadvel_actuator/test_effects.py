@@ -3,7 +3,6 @@
 import attrs
 import numpy as np
 import pytest
-from simulated_joints import NAMES, parameters
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
 from quadvel_actuator.effects import MemoryEffect, Stage, registry
@@ -15,6 +14,7 @@ from quadvel_sysid.model.jacobian import DELAY_STEP_S, Unknowns, jacobian, pack,
 from quadvel_sysid.model.torque_model import Model
 from quadvel_sysid.search.effect_candidates.registry import candidate_classes
 from tests.helpers.robots import ALIENGO
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters
 
 JOINTS = NAMES[:3]
 TRUTH = {

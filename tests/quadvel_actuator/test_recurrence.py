@@ -15,7 +15,7 @@ rows, start, one = np.linspace(0.0, 1.0, 50)[:, None], np.arange(50)[:, None] ==
 print(recurrence.backlash_series(rows, start, 0.1)[-1], recurrence.bouc_wen_series(rows, start, 0.5, 0.2)[-1])
 print(recurrence.rate_limit_series(rows, 0.0 * one, 0.001 * one, start, 1000.0)[-1])
 """
-SEVERAL = 3
+SEVERAL = 2
 
 
 def test_loops_compiled_by_concurrent_processes_serve_later_ones(tmp_path: Path) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from importlib import metadata
 
 import pytest
 
 from quadvel_bringup import doctor
 from quadvel_bringup.doctor import Finding
+from quadvel_bringup.version import version
 
 GOOD = [Finding(name, True, "1.0") for name in ("Python", *doctor.REQUIRED_PACKAGES, "GL", "ffmpeg")]
 
@@ -77,3 +79,15 @@ def test_an_rclpy_too_old_for_real_time_on_two_cores_is_named(monkeypatch: pytes
 def test_what_is_shipped_for_a_robot_is_named(robot: str, good: bool, text: str) -> None:
     finding = doctor.robot_files(robot)
     assert (finding.good, text in finding.text) == (good, True), finding
+
+
+def test_a_report_shows_versions_and_system_and_no_name_of_a_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/somebody")
+    monkeypatch.setenv("ROS_DISTRO", "jazzy")
+    found = Finding("robot", True, "running: policy_controller; policy /home/somebody/mine.onnx")
+    text = doctor.report([found])
+    assert f"quadvel: {version()}" in text
+    assert f"cyclonedds {metadata.version('cyclonedds')}" in text
+    assert "ROS_DISTRO: jazzy" in text
+    assert "ok   robot        running: policy_controller; policy ~/mine.onnx" in text
+    assert "somebody" not in text

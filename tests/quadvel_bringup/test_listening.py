@@ -7,13 +7,10 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
-
-from sockets import Bound, family_of, sockets_of
+from tests.helpers.sockets import Bound, family_of, sockets_of
 
 PROGRAM = [sys.executable, "-m", "quadvel_bringup"]
 SOCKETS_OF_DDS = 3  # discovery, data, and the one that sends

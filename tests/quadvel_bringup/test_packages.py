@@ -35,9 +35,7 @@ ROSDEP = {
 }
 """Names that rosdep has for modules"""
 PIP = {
-    **dict.fromkeys(
-        ("atheris", "cattrs", "cyclonedds", "distributed", "mcap", "mujoco", "onnx", "onnxruntime"), ""
-    ),
+    **dict.fromkeys(("cattrs", "cyclonedds", "distributed", "mcap", "mujoco", "onnx", "onnxruntime"), ""),
     **dict.fromkeys(
         ("matplotlib", "numba", "numpy", "onnxscript", "rich", "rosbags", "scipy", "tensorboard"), ""
     ),
@@ -57,7 +55,7 @@ BUILD_TOOLS = {"setuptools"}
 OPTIONAL = {"quadvel_eval", "quadvel_follow", "quadvel_lab", "quadvel_sim", "quadvel_sysid", "quadvel_why"}
 """What quadvel_bringup names as texts: its commands and nodes refuse to start where it is not installed"""
 HEAVY = {"matplotlib", "mujoco", "numba", "onnx", "scipy", "torch"}
-OF_TOOLS = ("docs", "test", "ros", "lint")
+OF_TOOLS = ("docs", "fuzz", "test", "ros", "lint")
 """Extras whose packages no source imports"""
 BY_TORCH = {"onnxscript", "tensorboard"}
 """What torch imports where a training asks it to export and to log"""

@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from quadvel_driver import fuzz, packets, wire
+from quadvel_driver import packets, wire
 from quadvel_driver.unitree_dds import wire as dds_wire
+from tests.quadvel_driver import fuzz
 
 BOTH = (wire, fuzz.aliengo_covered), (dds_wire, fuzz.go2_covered)
 

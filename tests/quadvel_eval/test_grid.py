@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from quadvel_eval import grid
 from quadvel_eval.grid import (
     GRIDS,
     Cell,
@@ -13,6 +14,8 @@ from quadvel_eval.grid import (
     evaluate_walk,
     grid_cells,
     max_displacement,
+    run_cell,
+    run_stance,
     summarise,
 )
 from quadvel_eval.segments import Segment
@@ -132,11 +135,26 @@ def test_drift_is_the_largest_distance_and_horizontal() -> None:
     )
 
 
+def short_cell(setup: Setup, cell: Cell) -> CellResult:
+    """As `run_cell`, for 2.5 s; in a process of its own."""
+    grid.COMMAND_DURATION_S = 2.5
+    return run_cell(setup, cell)
+
+
+def short_stance(setup: Setup, seed: int) -> float | None:
+    """As `run_stance`, for 1 s after a walk of 1 s; in a process of its own."""
+    grid.WALK_BEFORE_STANCE = [((0.5, 0.0, 0.0), 0.5), ((0.0, 0.0, 0.0), 0.5)]
+    grid.STANCE_DURATION_S = 1.0
+    return run_stance(setup, seed)
+
+
 def test_a_grid_over_processes_equals_itself_in_the_order_of_its_cells(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     few = np.array([0.0, 0.3]), np.array([0.0]), np.array([0.0])
     monkeypatch.setitem(GRIDS, "quick", few)
+    monkeypatch.setattr(grid, "run_cell", short_cell)
+    monkeypatch.setattr(grid, "run_stance", short_stance)
     heard: list[tuple[int, int]] = []
     evaluation = evaluate(Setup(estimator="truth"), "quick", 1, lambda done, of: heard.append((done, of)))
     assert [cell["command"][0] for cell in evaluation["cells"]] == [0.0, 0.3]

@@ -5,43 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import attrs
 import pytest
-from matplotlib.figure import Figure
 
 from quadvel_eval.paper import files, study
 from quadvel_eval.paper.cli import paper_command
-from quadvel_eval.paper.section import Job, JobResults, Record, Row, Section, Study, by_policy, largest
+from quadvel_eval.paper.section import Study
 from quadvel_eval.pool import Call
 from quadvel_policy.policy_file import SHIPPED_POLICY
-
-
-@attrs.frozen
-class Powers(Section):
-    """Powers of two by jobs."""
-
-    name: ClassVar[str] = "powers"
-    title: ClassVar[str] = "Powers"
-    method: ClassVar[str] = "Counted."
-    count: int = 3
-
-    def jobs(self, study: Study) -> list[Job]:
-        return [
-            Job({"policy": name, "k": k}, (pow, 2, k)) for name in study.policies for k in range(self.count)
-        ]
-
-    def to_records(self, answers: JobResults) -> list[Record]:
-        return [{**labels, "value": float(answer), "none": None} for labels, answer in answers]
-
-    def figure(self, records: Sequence[Record]) -> Figure:
-        figure = Figure(figsize=(1.0, 1.0))
-        figure.subplots().plot([record["value"] for record in records])
-        return figure
-
-    def rows(self, records: Sequence[Record]) -> list[Row]:
-        return [Row("largest", "m", 5.0, by_policy(records, lambda r: largest(r, "value")), 1)]
+from tests.helpers.sections import Powers
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,17 @@ from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_eval.offline import replay_command
 from quadvel_eval.recording_plot import plot_command, read_recorded_run
 from quadvel_recordings.definitions import STORE
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "quadvel_recordings"))
-from joint_bags import PERIOD, ROWS, T0, Message, go2, joint_states, motion, own, rosbag2
+from tests.quadvel_recordings.joint_bags import (
+    PERIOD,
+    ROWS,
+    T0,
+    Message,
+    go2,
+    joint_states,
+    motion,
+    own,
+    rosbag2,
+)
 
 SECONDS = 1e-9 * PERIOD * (ROWS - 1)
 ORDERED = [name for leg in ("FL", "FR", "RL", "RR") for name in JOINT_NAMES if name.startswith(leg)]

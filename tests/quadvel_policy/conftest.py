@@ -5,7 +5,6 @@ The policy is a tiny LSTM written with onnx.helper, or a stub that records its i
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,7 +19,6 @@ import quadvel_dds
 from quadvel_policy.observation import PolicyMetadata, default_observation
 from tests.helpers.robots import ALIENGO
 
-sys.path.insert(0, str(Path(__file__).parent))  # for `rig`
 quadvel_dds.install()  # before a test module imports rclpy
 
 import rclpy  # noqa: E402

@@ -11,7 +11,6 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
-from rig import FORWARD, PERIOD, STILL, Rig, assert_damping
 
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy import command_limits
@@ -23,6 +22,7 @@ from quadvel_policy.guards.legs import EncoderInconsistent
 from quadvel_policy.supervisor import SUPERVISOR_FAULTS
 from quadvel_policy.tick_input import MotorStatus, TickInput
 from tests.helpers.robots import ALIENGO
+from tests.quadvel_policy.rig import FORWARD, PERIOD, STILL, Rig, assert_damping
 
 Changes = dict[str, Any]
 """Changes of the state of one tick, its age, or the time since the previous one"""

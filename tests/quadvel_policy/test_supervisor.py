@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rig import FORWARD, STILL, Rig, assert_damping
 
 from quadvel_description.state import MODE_SERVO
 from quadvel_nodes.parameters import make_record, parameter_fields
@@ -22,6 +21,7 @@ from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.transitions import MODES
 from tests.helpers.robots import ALIENGO
+from tests.quadvel_policy.rig import FORWARD, STILL, Rig, assert_damping
 
 WITHOUT_ENCODERS = [guard for guard in GUARDS if guard is not EncoderInconsistent]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import resource
 import struct
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,18 @@ from quadvel_recordings import bounds
 from quadvel_recordings.definitions import STORE
 from quadvel_recordings.joint_log import LEG_JOINTS, JointLog, read_joint_log, require_commands
 from quadvel_recordings.reading import RecordingError, read_messages
-
-sys.path.insert(0, str(Path(__file__).parent))
-from joint_bags import PERIOD, ROWS, T0, empty, go2, joint_states, motion, own, ros1, rosbag2
+from tests.quadvel_recordings.joint_bags import (
+    PERIOD,
+    ROWS,
+    T0,
+    empty,
+    go2,
+    joint_states,
+    motion,
+    own,
+    ros1,
+    rosbag2,
+)
 
 
 def check(log: JointLog, joints: tuple[str, ...] = LEG_JOINTS) -> None:

@@ -10,9 +10,9 @@ from typing import Any
 
 import attrs
 import numpy as np
-from simulated_joints import NAMES, parameters, record
 
 from quadvel_sysid.logs.log import Log
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters, record
 
 JOINTS = 4
 DT = 0.001

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,7 @@ from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.logs.read_log import read_log
 from quadvel_sysid.report.sanity_checks import contradictions
 from quadvel_sysid.statistics.baselines import baseline_errors, explained_share, torque_variance
-
-sys.path.insert(0, str(Path(__file__).parent))
-from servo_logs import recorded
+from tests.quadvel_sysid.servo_logs import recorded
 
 
 def test_pd_law_leaves_friction_and_linear_filter_leaves_less(tmp_path: Path) -> None:

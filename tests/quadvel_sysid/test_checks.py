@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,7 @@ from quadvel_sysid.logs.check_log import CheckedLog, check_log
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
 from tests.helpers.robots import ALIENGO
-
-sys.path.insert(0, str(Path(__file__).parent))
-from joint_logs import KD, KP, fields, npz
+from tests.quadvel_sysid.joint_logs import KD, KP, fields, npz
 
 SHARE = np.pi / 180.0
 

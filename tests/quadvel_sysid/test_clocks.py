@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import attrs
 import numpy as np
 import pytest
-from simulated_joints import parameters, record
 
 from quadvel_sysid.data.clocks import align_commands, choose_stamps, clock_findings
 from quadvel_sysid.data.dataset import Dataset
@@ -15,6 +14,7 @@ from quadvel_sysid.data.split import block_length, reported_rows
 from quadvel_sysid.logs.check_log import CheckedLog
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.options import SEARCH_DEFAULTS
+from tests.quadvel_sysid.simulated_joints import parameters, record
 
 WINDOWS = (0.001,)
 

@@ -3,7 +3,6 @@
 import attrs
 import numpy as np
 import pytest
-from simulated_joints import parameters, record
 
 from quadvel_sysid.data.noise import noise_variance
 from quadvel_sysid.data.signals import Samples
@@ -16,6 +15,7 @@ from quadvel_sysid.statistics.criterion import (
     normality_p_values,
     whiteness_p_values,
 )
+from tests.quadvel_sysid.simulated_joints import parameters, record
 
 BEGIN, END = 2.0, 4.0  # s, of a stand
 

@@ -3,7 +3,6 @@
 import attrs
 import numpy as np
 import pytest
-from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import ActuatorModel
 from quadvel_actuator.effects.dynamics import Armature, TimestampSkew
@@ -18,6 +17,7 @@ from quadvel_sysid.model.fit import fit, fit_delay_profile, fit_delay_splits, sq
 from quadvel_sysid.model.torque_model import Model
 from quadvel_sysid.search.effect_candidates.dynamics import ArmatureCandidate, TimestampSkewCandidate
 from quadvel_sysid.statistics.confidence import intervals
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters, record
 
 JOINTS = NAMES[:2]
 ONE = np.zeros(2, dtype=np.intp)

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import attrs
 import numpy as np
 import pytest
 
 from quadvel_sysid.logs.check_log import CheckedLog, check_log
 from quadvel_sysid.logs.findings import Finding
-
-sys.path.insert(0, str(Path(__file__).parent))
-from drawn_logs import as_log, drawn, of_torque_commands, with_spikes
+from tests.quadvel_sysid.drawn_logs import as_log, drawn, of_torque_commands, with_spikes
 
 SEEDS = (1, 3)
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import attrs
 import pytest
-from simulated_joints import NAMES, parameters, record
 
 import quadvel_actuator
 from quadvel_actuator import Effect, effects
@@ -13,6 +12,7 @@ from quadvel_actuator.effects import AddedEffect, Parameter
 from quadvel_sysid.identify import identify
 from quadvel_sysid.model.effect_candidate import EffectCandidate
 from quadvel_sysid.search.effect_candidates import registry
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters, record
 
 JOINTS = NAMES[:2]
 

@@ -23,9 +23,7 @@ import scipy.io
 
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
-
-sys.path.insert(0, str(Path(__file__).parent))
-from joint_logs import fields
+from tests.quadvel_sysid.joint_logs import fields
 
 JOINTS = ["hip", "knee"]
 GIVEN = {name: values[:, :2] if np.ndim(values) == 2 else values for name, values in fields(0.2).items()}

@@ -5,7 +5,6 @@ import weakref
 import attrs
 import numpy as np
 import pytest
-from simulated_joints import NAMES, TABLE_4, parameters, record
 
 from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_sysid.data.dataset import Dataset
@@ -16,6 +15,7 @@ from quadvel_sysid.logs.check_log import check_logs
 from quadvel_sysid.logs.excerpts import cut_excerpts
 from quadvel_sysid.options import IdentifyOptions
 from tests.helpers.robots import ALIENGO
+from tests.quadvel_sysid.simulated_joints import NAMES, TABLE_4, parameters, record
 
 JOINTS = NAMES[:2]
 

@@ -10,9 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from quadvel_sysid import cli
-
-sys.path.insert(0, str(Path(__file__).parent))
-from joint_logs import fields, mcap, npz
+from tests.quadvel_sysid.joint_logs import fields, mcap, npz
 
 
 def test_help_shows_an_example_and_the_fields_of_a_log() -> None:

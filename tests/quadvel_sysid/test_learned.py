@@ -2,13 +2,13 @@
 
 import attrs
 import numpy as np
-import odd_joints
 import pytest
-from simulated_joints import parameters, record
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_sysid.identify import identify
 from tests.helpers.robots import ALIENGO
+from tests.quadvel_sysid import odd_joints
+from tests.quadvel_sysid.simulated_joints import parameters, record
 
 VARIANCE = 0.066  # of the torque noise of these logs
 

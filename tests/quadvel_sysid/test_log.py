@@ -20,9 +20,7 @@ from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
 from quadvel_sysid.logs.readers import raw
 from tests.helpers.robots import ALIENGO, GO2
-
-sys.path.insert(0, str(Path(__file__).parent))
-from joint_logs import csv, fields, mcap, npz
+from tests.quadvel_sysid.joint_logs import csv, fields, mcap, npz
 
 PLAIN = [name.removesuffix("_joint") for name in JOINT_NAMES]
 

@@ -3,11 +3,11 @@
 import attrs
 import numpy as np
 import pytest
-from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
 from quadvel_sysid.identify import identify
 from quadvel_sysid.search import context, lost_commands
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters, record
 
 JOINTS = NAMES[:2]
 

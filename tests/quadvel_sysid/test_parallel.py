@@ -8,13 +8,13 @@ from pathlib import Path
 
 import attrs
 import pytest
-from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
 from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.identify import identify
 from quadvel_sysid.options import IdentifyOptions
 from quadvel_sysid.parallel import parallel_map
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters, record
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ import sys
 import attrs
 import numpy as np
 import pytest
-from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_sysid.data.dataset import Dataset
@@ -16,6 +15,7 @@ from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.options import IdentifyOptions
 from tests.helpers.robots import ALIENGO
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters, record
 
 CALF = ("FR_calf_joint",)
 IDEAL = attrs.evolve(ActuatorParameters.ideal(ALIENGO), torque_limit=45.0)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import attrs
 import numpy as np
 import pytest
-from simulated_joints import parameters, record
 
 from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.data.split import DataSplit
 from quadvel_sysid.model.torque_model import Model
 from quadvel_sysid.report.sanity_checks import implausibilities
+from tests.quadvel_sysid.simulated_joints import parameters, record
 
 
 @pytest.fixture(scope="module")

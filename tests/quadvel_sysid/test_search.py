@@ -1,11 +1,13 @@
 """Search for effects, end to end: logs in, reports out."""
 
+from functools import cache
+
 import attrs
 import pytest
-from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
 from quadvel_sysid.identify import identify
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters, record
 
 JOINTS = NAMES[:2]
 FRICTION = Effect("coulomb_friction", JOINTS, {"c": 0.5, "v_0": 0.05})
@@ -15,6 +17,13 @@ SPRING = Effect("parallel_spring", JOINTS, {"k": 3.0, "q0": 0.6})
 def _log(*effects, seconds=3.0, seed=2):
     truth = parameters(effects, input_delay=0.009, output_delay=0.003)
     return record(attrs.evolve(truth, joints=JOINTS), 2, seconds, 500, seed=seed)
+
+
+@cache
+def _friction_report():
+    """The log with friction, and its report; no test changes them."""
+    log = _log(FRICTION)
+    return log, identify([log]).report
 
 
 def _named(*effects, **options):
@@ -36,8 +45,9 @@ def test_a_lag_is_distinguished_from_the_delays_that_it_biases():
 
 
 def test_shared_values_are_reported_once_and_others_for_each_joint():
-    same, _ = _named(FRICTION)
-    assert isinstance(same["coulomb_friction"]["params"]["c"]["value"], float)
+    (same,) = _friction_report()[1]["effects"]
+    assert same["name"] == "coulomb_friction"
+    assert isinstance(same["params"]["c"]["value"], float)
     other = [
         attrs.evolve(FRICTION, joints=JOINTS[k : k + 1], parameters={"c": c, "v_0": 0.05})
         for k, c in enumerate((0.4, 1.2))
@@ -48,8 +58,7 @@ def test_shared_values_are_reported_once_and_others_for_each_joint():
 
 def test_error_and_p_value_come_from_rows_that_select_nothing():
     """A change of the reported rows changes neither the effects nor the training error."""
-    log = _log(FRICTION)
-    first = identify([log]).report
+    log, first = _friction_report()
     block = (log.t / 0.2).astype(int) % 5 == 4  # s, as in `preparation.split_rows`
     loud = log.tau.copy()
     loud[block] += 0.5 * (-1.0) ** (log.t[block, None] * 500.0).round()

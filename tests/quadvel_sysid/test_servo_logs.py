@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import json
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,7 @@ from quadvel_sysid.logs.checks.table import markdown_table
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
 from quadvel_sysid.logs.readers.columns import ColumnMap
-
-sys.path.insert(0, str(Path(__file__).parent))
-from servo_logs import KP, recorded
+from tests.quadvel_sysid.servo_logs import KP, recorded
 
 SEEDS = (3, 14)
 

@@ -3,11 +3,11 @@
 import attrs
 import numpy as np
 import pytest
-from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator.effects.elastic import Deadband
 from quadvel_sysid.data.signals import Samples, scattered_rows
 from quadvel_sysid.search.effect_candidates.elastic import DeadbandCandidate
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters, record
 
 JOINTS = NAMES[:2]
 

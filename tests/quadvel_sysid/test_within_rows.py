@@ -3,8 +3,6 @@
 import attrs
 import numpy as np
 import pytest
-from joint_logs import fields, npz
-from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator.effects.dynamics import FirstOrderLag, VelocityFilter
 from quadvel_actuator.effects.limits import SlewLimit
@@ -17,6 +15,8 @@ from quadvel_sysid.model.applied_effect import AppliedEffect
 from quadvel_sysid.model.torque_model import Model
 from quadvel_sysid.search.effect_candidates.dynamics import LagCandidate, VelocityFilterCandidate
 from quadvel_sysid.search.effect_candidates.limits import SlewLimitCandidate
+from tests.quadvel_sysid.joint_logs import fields, npz
+from tests.quadvel_sysid.simulated_joints import NAMES, parameters, record
 
 
 def _slewing(rate):

@@ -24,10 +24,7 @@ import viser
 import yaml
 
 from quadvel_bringup.stack import PARAMETERS
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
-
-from sockets import family_of, sockets_of, unix_listeners
+from tests.helpers.sockets import family_of, sockets_of, unix_listeners
 
 QUADVEL = (sys.executable, "-m", "quadvel_bringup")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

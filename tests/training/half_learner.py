@@ -8,12 +8,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from test_ppo import learner, rollout
-
 from quadvel_training import loop, process_group
 from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun
+from tests.training.test_ppo import learner, rollout
 
 
 def update(part: slice) -> dict[str, torch.Tensor]:

@@ -15,7 +15,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_training import process_group  # noqa: E402
 
-HERE = Path(__file__).parent
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def another(monkeypatch, tmp_path):
     monkeypatch.setenv("RANK", "0")
     monkeypatch.setenv("LOCAL_RANK", "0")
     with subprocess.Popen(
-        [sys.executable, HERE / "half_learner.py", tmp_path / "run.pt"], env=other
+        [sys.executable, "-m", "tests.training.half_learner", tmp_path / "run.pt"], env=other, cwd=ROOT
     ) as process:
         try:
             process_group.join("cpu")
@@ -41,8 +41,7 @@ def another(monkeypatch, tmp_path):
 
 
 def test_two_processes_with_half_of_the_robots_each_learn_as_one(another, monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(HERE)
-    from half_learner import run, update
+    from tests.training.half_learner import run, update
 
     together = update(slice(0, 4))
     (weights, grid, command, samples), other = process_group.gather(run(tmp_path / "run.pt"))

@@ -1,7 +1,7 @@
 """Cases of the second generator: a log, perhaps a second one of the same robot, and the truth.
 
 `make_case(kind, index, seed)` is reproducible. The truth has the form of the first generator's, so
-that `tests.identification.verdicts` scores both.
+that `benchmarks.identification.verdicts` scores both.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from benchmarks.identification.hidden.cases import Case
 from benchmarks.identification.other_plant.machine import TICK_S, Machine, Run, run
-from tests.identification.hidden.cases import Case
 
 Array = NDArray[np.float64]
 
@@ -256,7 +256,8 @@ def _log(
 ) -> tuple[dict[str, Any], float]:
     """Arrays of a log, and the error (N^2 m^2) of the true model on it."""
     rows = np.arange(round(0.05 / TICK_S), len(made.q), round(1.0 / rate / TICK_S))
-    true_t, shape = rows * TICK_S, (len(rows), made.q.shape[1])
+    true_t: Array = (rows * TICK_S).astype(np.float64)
+    shape = len(rows), made.q.shape[1]
     style = str(rng.choice(STAMPS, p=(0.6, 0.3, 0.1)))
     t = _stamps(true_t, style, rate, rng)
     clock = float(rng.uniform(-0.002, 0.002))  # of this recording

@@ -223,20 +223,27 @@ def doctor(
     robot: Annotated[
         str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or a robot.yaml.")
     ] = DEFAULT_ROBOT,
+    report: Annotated[
+        bool, typer.Option("--report", help="Print a text for a bug report, with versions and system.")
+    ] = False,
 ) -> None:
     """Check what is installed on this machine and what it can run.
 
     \b
     For example:
       quadvel doctor
+      quadvel doctor --report
     """
-    from .doctor import abilities, examine, robot_files
+    from . import doctor
 
+    if report:
+        print(doctor.report([*doctor.examine()]))
+        return
     findings = []
-    for finding in chain(examine(), [robot_files(robot)]):
+    for finding in chain(doctor.examine(), [doctor.robot_files(robot)]):
         findings.append(finding)
         print(f"{'ok  ' if finding.good else 'note'} {finding.subject:12} {finding.text}", flush=True)
-    for ability, possible in abilities(findings):
+    for ability, possible in doctor.abilities(findings):
         print(f"{'can' if possible else 'cannot'} run {ability}")
 
 

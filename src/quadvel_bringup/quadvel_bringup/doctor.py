@@ -4,21 +4,30 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from importlib import metadata, util
+from pathlib import Path
 
 import attrs
 import numpy as np
 
 import quadvel_dds
 
+from .version import version
+
 ROBOT_PACKAGES = ("numpy", "cyclonedds", "onnxruntime", "rosbags")
 """Packages that the nodes of a robot need."""
 REQUIRED_PACKAGES = {**dict.fromkeys(ROBOT_PACKAGES, "robot"), "mcap": "log", "mujoco": "sim", "scipy": "sim"}
 """Packages that the simulated robot needs, and the extra of quadvel-core that installs them."""
+REPORTED_VARIABLES = (
+    *("ROS_DISTRO", "RMW_IMPLEMENTATION", "ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"),
+    *("QUADVEL_MIDDLEWARE", "MUJOCO_GL"),
+)
+"""Environment variables that a bug report shows; they hold no address and no secret."""
 GL_BACKENDS = ("egl", "osmesa")
 GL_PACKAGES = "libegl1 libopengl0"
 
@@ -241,3 +250,57 @@ def abilities(findings: list[Finding]) -> Iterator[tuple[str, bool]]:
     yield "quadvel eval, bench", runs
     yield "the video of the demo", runs and good["GL"] and good["ffmpeg"]
     yield "training", runs and torch
+
+
+def report(findings: list[Finding]) -> str:
+    """Format findings for a bug report, with the versions of all that quadvel depends on.
+
+    It shows no name of a user, a host or an address.
+
+    Args:
+        findings: All findings of `examine`.
+
+    Returns:
+        Markdown text.
+    """
+    lines = [
+        f"quadvel: {version()}",
+        f"system: {_distribution()}, Linux {platform.release()}, {platform.machine()}, {_processor()}",
+        *(f"{name}: {os.environ[name]}" for name in REPORTED_VARIABLES if name in os.environ),
+        f"packages: {', '.join(_dependencies())}",
+        "",
+        *(f"{'ok  ' if one.good else 'note'} {one.subject:12} {one.text}" for one in findings),
+    ]
+    home = str(Path.home())
+    text = "\n".join(line.replace(home, "~") if home != "/" else line for line in lines)
+    return f"```text\n{text}\n```"
+
+
+def _distribution() -> str:
+    """Name of the operating system."""
+    try:
+        return platform.freedesktop_os_release()["PRETTY_NAME"]
+    except OSError:
+        return platform.system()
+
+
+def _processor() -> str:
+    """Model of the processor and memory of the machine."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    models = [line.partition(": ")[2] for line in lines if line.startswith(("model name", "Model"))]
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return f"{models[0] if models else 'unknown processor'}, {memory:.0f} GiB"
+
+
+def _dependencies() -> Iterator[str]:
+    """Yield name and version of each installed package that quadvel names, with all its extras."""
+    try:
+        named = metadata.requires("quadvel-core") or []
+    except metadata.PackageNotFoundError:  # built by colcon, package by package
+        named = [*REQUIRED_PACKAGES]
+    names = {re.split(r"[^\w.-]", requirement, maxsplit=1)[0].lower() for requirement in named}
+    for name in sorted(names - {"quadvel-core"}):
+        try:
+            yield f"{name} {metadata.version(name)}"
+        except metadata.PackageNotFoundError:
+            continue

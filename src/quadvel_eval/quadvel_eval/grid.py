@@ -24,6 +24,7 @@ COMMAND_DURATION_S = 6.0  # of each command; the last 4 s are evaluated
 GRIDS: dict[str, tuple[Array, Array, Array]] = {  # all combinations of vx, vy (m/s) and wz (rad/s)
     "quick": (np.arange(-2, 4) / 2, np.array([-0.4, 0.0, 0.4]), np.array([-1.0, 0.0, 1.0])),
     "paper": (np.arange(-5, 6) / 2, np.arange(-5, 6) / 5, np.array([0.0])),
+    "tiny": (np.array([0.5, 1.0]), np.array([0.0]), np.array([0.0, 0.5])),
 }
 WALK_BEFORE_STANCE = [
     ((0.5, 0.0, 0.0), 2.0),

@@ -52,7 +52,7 @@ def healthy_values() -> dict[str, float]:
     """Return the largest number that each cause measured on healthy walks.
 
     Returns:
-        Numbers by name of the cause; `python -m tests.why.calibrate` writes them.
+        Numbers by name of the cause; `python -m benchmarks.why.calibrate` writes them.
     """
     return {name: float(value) for name, value in read_yaml(LIMITS_FILE, "limits")["healthy"].items()}
 

@@ -55,7 +55,7 @@ A cause is found if its number exceeds its limit. This is the smallest number th
 (delay, load, slope). The walks of the limits have other seeds and plants than those of the test. With
 no false alarm in n walks, the rate of false alarms is below 3 / n at a confidence of 95 %.
 
-`python -m tests.why.score` measures the diagnosis on walks with hidden defects, injected by code
+`python -m benchmarks.why.score` measures the diagnosis on walks with hidden defects, injected by code
 that shares nothing with it ([results](results/why.md)). `python -m quadvel_why.page` prints this page.
 
 {tables}

@@ -159,7 +159,9 @@ def write_page(folder: Path, sections: Sequence[Section]) -> None:
         "those of simulated robots with actuator model, sensor noise, delays and the estimator in the loop. In brackets: ours",
         "minus the paper's. Figures that fall short stand here as they are.",
         "",
-        *_table([attrs.evolve(r, what=f"{s.name}: {r.what}") for s in there for r in rows[s] if r.key]),
+        *markdown_table(
+            [attrs.evolve(r, what=f"{s.name}: {r.what}") for s in there for r in rows[s] if r.key]
+        ),
         "",
     ]
     for section in there:
@@ -178,7 +180,7 @@ def _chapter(section: Section, rows: Sequence[Row], content: Mapping[str, Any]) 
         "",
         section.method,
         "",
-        *_table(rows),
+        *markdown_table(rows),
         "",
         f"![{section.title}]({section.name}.png)",
         "",
@@ -187,8 +189,15 @@ def _chapter(section: Section, rows: Sequence[Row], content: Mapping[str, Any]) 
     ]
 
 
-def _table(rows: Sequence[Row]) -> list[str]:
-    """Lines of a Markdown table of rows."""
+def markdown_table(rows: Sequence[Row]) -> list[str]:
+    """Format rows as a Markdown table with a column for each policy.
+
+    Args:
+        rows: The rows.
+
+    Returns:
+        Lines of the table.
+    """
     policies = distinct([{"policy": name} for row in rows for name in row.ours], "policy")
     lines = [
         f"| | paper | {' | '.join(policies)} |",

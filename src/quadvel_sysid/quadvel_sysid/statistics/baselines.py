@@ -37,28 +37,45 @@ def baseline_errors(samples: Samples, fitted: Bools, heldout: Bools) -> dict[str
         For `joint_pd` and `ridge`: `heldout_mse` (N^2 m^2), and `heldout_explained`, the share of
         the torque's variance.
     """
-    squares = {"joint_pd": 0.0, "ridge": 0.0}
-    torque = np.concatenate([np.asarray(log.without_feed_forward().tau, dtype=float) for log in samples.logs])
+    torque, count = _torque(samples), max(int(heldout.sum()), 1)
+    variance = torque_variance(samples.tau, heldout)
+    found: dict[str, dict[str, float | None]] = {}
+    for name, predicted in baseline_predictions(samples, fitted).items():
+        mse = float(np.sum((torque - predicted) ** 2, where=heldout)) / count
+        found[name] = {"heldout_mse": mse, "heldout_explained": explained_share(mse, variance)}
+    return found
+
+
+def baseline_predictions(samples: Samples, fitted: Bools) -> dict[str, Array]:
+    """Predict the torque of all rows with the baselines.
+
+    Args:
+        samples: Rows of all logs.
+        fitted: (N, J) rows that are fitted.
+
+    Returns:
+        For `joint_pd` and `ridge`: torque without the feed-forward torque, (N, J), N m.
+    """
+    torque = _torque(samples)
+    found = {"joint_pd": np.empty_like(torque), "ridge": np.empty_like(torque)}
     step = max(LAG_STEP_S, float(np.median([log.period for log in samples.logs])))
     past = tuple(step * np.arange(max(1, round(FILTER_SPAN_S / step)) + 1))
     for j in range(fitted.shape[1]):
-        tau, fit, reported = torque[:, j], fitted[:, j], heldout[:, j]
+        tau, fit = torque[:, j], fitted[:, j]
         laws = [
             _regressors(samples, j, (delay,), (0.0,))
             for delay in np.arange(0.0, MAX_DELAY_S + LAG_STEP_S / 2, LAG_STEP_S)
         ]
-        best = min(
-            (_residual(law, tau, fit, 0.0) for law in laws), key=lambda one: float(np.mean(one[fit] ** 2))
-        )
-        squares["joint_pd"] += float(np.sum(best[reported] ** 2))
-        miss = _residual(_regressors(samples, j, past, past), tau, fit, RIDGE_PENALTY)
-        squares["ridge"] += float(np.sum(miss[reported] ** 2))
-    count = max(int(heldout.sum()), 1)
-    variance = torque_variance(samples.tau, heldout)
-    return {
-        name: {"heldout_mse": total / count, "heldout_explained": explained_share(total / count, variance)}
-        for name, total in squares.items()
-    }
+        residuals = (_residual(law, tau, fit, 0.0) for law in laws)
+        best = min(residuals, key=lambda one: float(np.mean(one[fit] ** 2)))
+        found["joint_pd"][:, j] = tau - best
+        found["ridge"][:, j] = tau - _residual(_regressors(samples, j, past, past), tau, fit, RIDGE_PENALTY)
+    return found
+
+
+def _torque(samples: Samples) -> Array:
+    """Measured torque without the feed-forward torque, (N, J), N m."""
+    return np.concatenate([np.asarray(log.without_feed_forward().tau, dtype=float) for log in samples.logs])
 
 
 def torque_variance(torque: Array, rows: Bools) -> float:

@@ -29,7 +29,7 @@ TIME_ROUNDING_S = 1e-9
 FRICTION_SPEED_RAD_S = 0.05
 """rad/s; width of the smooth step of friction, tanh(dq / width)."""
 
-# `python -m tests.identification.limits FOLDER` prints the distributions behind these limits; the
+# `python -m benchmarks.identification.limits FOLDER` prints the distributions behind these limits; the
 # numbers here include two walks and a replay of a Go2.
 EXPLAINED_ERROR_SHARE = 0.5
 """Command, angle and speed explain a torque if they leave less than this share of it: so for 95 % of

@@ -1,0 +1,1 @@
+"""Benchmark of velocity tracking in simulation, for policy files of anybody."""

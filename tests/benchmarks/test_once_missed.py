@@ -1,0 +1,73 @@
+"""Regression tests: hidden effects that the identification once named wrongly."""
+
+import pytest
+
+from benchmarks.identification import adapter
+from benchmarks.identification.hidden.cases import make_case
+from benchmarks.identification.verdicts import score_report
+
+
+@pytest.mark.parametrize(
+    ("kind", "index", "seed"),
+    [
+        ("velocity_filter", 0, 17),  # with wrong delays of 20 ms its score is low
+        pytest.param(
+            "torque_saturation", 0, 606, marks=pytest.mark.long
+        ),  # it biased the delays of the plain fit by 10 ms, beyond the grid
+        pytest.param(
+            "soft_stop", 1, 913, marks=pytest.mark.long
+        ),  # a spring and less than a period of cogging can form any curve
+        ("backlash", 2, 912),  # backlash fits later commands nearly as well as the true ones
+        pytest.param(
+            "triple", 0, 606, marks=pytest.mark.long
+        ),  # gains kept the values for delays that the score test had clipped
+        pytest.param(
+            "cross_coupling", 0, 17, marks=pytest.mark.long
+        ),  # coupling to an angle, whose zero is a convention
+        pytest.param(
+            "quadratic_drag", 1, 18, marks=pytest.mark.long
+        ),  # every second row had the same phase to commands at 500 Hz, which hid a wrong delay
+        pytest.param(
+            "backlash", 0, 21, marks=pytest.mark.long
+        ),  # at other delays than its own the right form has a low score
+        pytest.param(
+            "close_pair", 1, 21, marks=pytest.mark.long
+        ),  # cogging on three joints, a spring on one of them
+        pytest.param(
+            "close_pair", 3, 27, marks=pytest.mark.long
+        ),  # the drag of a slow hip exceeded its bounds
+        pytest.param(
+            "close_pair", 1, 27, marks=pytest.mark.long
+        ),  # the search stopped before a spring replaced the offset
+        pytest.param("pair", 2, 27, marks=pytest.mark.long),  # a lag that only one joint shows
+        pytest.param(
+            "table_4", 5, 27, marks=pytest.mark.long
+        ),  # in 1 of 20 logs the delays leave the drive's steps by chance
+        pytest.param(
+            "speed_band_drag", 0, 28, marks=pytest.mark.long
+        ),  # a drag that was identified as lost commands
+        pytest.param(
+            "table_4", 6, 17, marks=pytest.mark.long
+        ),  # held-out rows have another phase to their commands
+    ],
+)
+def test_the_effect_is_named_correctly(kind, index, seed, tmp_path):
+    assert _scored(kind, index, seed, tmp_path)["verdict"] == "right"
+
+
+@pytest.mark.parametrize(
+    ("kind", "index", "seed"),
+    [
+        pytest.param(
+            "armature", 14, 28, marks=pytest.mark.long
+        ),  # lifted feet hardly separate the two delays of an inertia
+    ],
+)
+def test_the_intervals_contain_the_truth(kind, index, seed, tmp_path):
+    assert [one["covered"] for one in _scored(kind, index, seed, tmp_path)["intervals"]] == [True]
+
+
+def _scored(kind, index, seed, tmp_path):
+    case = make_case(kind, index, seed)
+    logs = [path.rename(tmp_path / path.name) for path in case.save(tmp_path / "truth")]
+    return score_report(adapter.identify(logs[:1], logs[1:]), case.truth)
