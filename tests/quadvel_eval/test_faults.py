@@ -30,7 +30,7 @@ def case(name: str) -> Case:
 
 @cache
 def _clock_run() -> FaultRun:
-    return run_case(case("clock wrong stance"), seed=0)
+    return run_case("aliengo", case("clock wrong stance"), seed=0)
 
 
 def clock_run() -> FaultRun:

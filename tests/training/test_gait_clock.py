@@ -20,43 +20,89 @@ WALK, STAND = np.array([[1.0, 0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]])
 NONE = np.zeros((1, 4), bool)
 
 
+class FixedCommands:
+    """One command for each robot, for ever."""
+
+    hold = (1e3, 1e3)
+
+    def __init__(self, command: np.ndarray) -> None:
+        self.command = command
+
+    def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        return self.command[:n]
+
+    def contains(self, velocity: np.ndarray) -> np.ndarray:
+        return np.ones(len(velocity), bool)
+
+
+def advance(clock: GaitClock, command: np.ndarray, speed: float = 0.0, stepped: np.ndarray = NONE) -> None:
+    clock.advance(command, np.full(len(command), speed), stepped, PERIOD)
+
+
 def test_steps_are_slow_at_rest_and_fast_and_short_on_the_ground_at_speed():
-    command = np.array([[0.0, 0, 0, 0], [0.5, 0, 0, 0], [0, 0, 4.0, 0], [-3.0, 0, 0, 0], [4.2, 0, 0, 0]])
-    assert step_frequency(command) == pytest.approx([1.9, 2.175, 2.56, 3.55, 4.2])
-    assert duty_factor(command) == pytest.approx([0.68, 0.645, 0.596, 0.47, 0.386])
+    velocity = np.array([[0.0, 0, 0], [0.5, 0, 0], [0, 0, 4.0], [-3.0, 0, 0], [4.2, 0, 0]])
+    assert step_frequency(velocity) == pytest.approx([1.9, 2.175, 2.56, 3.55, 4.2])
+    assert duty_factor(velocity) == pytest.approx([0.68, 0.645, 0.596, 0.47, 0.386])
 
 
 def test_diagonal_feet_move_together_and_the_pairs_half_a_cycle_apart():
     clock = GaitClock(1)
-    clock.advance(WALK, NONE, PERIOD)
+    advance(clock, WALK)
     fr, fl, rr, rl = clock.foot_phases()[0]
     assert (fr, fl) == (rl, rr)
     assert abs(fr - fl) == pytest.approx(0.5)
 
 
-def test_the_clock_runs_at_its_frequency_and_waits_in_stance():
+def test_the_plan_accelerates_to_the_command_and_its_clock_runs_at_that_frequency():
+    clock, phase = GaitClock(1), START_PHASE
+    advance(clock, WALK)
+    for cycle in range(2, 13):
+        advance(clock, WALK)
+        velocity = min(4.0 * PERIOD * cycle, 1.0)
+        phase += PERIOD * (1.9 + 0.55 * velocity)
+        assert clock.velocity[0] == pytest.approx([velocity, 0.0, 0.0])
+    assert clock.phase[0] == pytest.approx(phase % 1.0)
+
+
+def test_a_robot_that_is_told_to_stand_steps_until_it_is_at_rest_on_four_feet():
     clock = GaitClock(1)
-    for _ in range(10):
-        clock.advance(WALK, NONE, PERIOD)
-    assert clock.phase[0] == pytest.approx((START_PHASE + 10 * PERIOD * 2.45) % 1.0)
-    clock.advance(STAND, NONE, PERIOD)
+    for _ in range(50):
+        advance(clock, WALK, speed=1.0)
+    for _ in range(50):
+        advance(clock, STAND, speed=0.3)
+    assert clock.walking[0]
+    clock.phase[:] = 0.8  # FR and RL in the air
+    advance(clock, STAND)
+    assert clock.walking[0]
+    clock.phase[:] = 0.6  # all four planned to be down
+    advance(clock, STAND)
+    assert not clock.walking[0]
+    advance(clock, STAND)
     assert clock.phase[0] == START_PHASE
+
+
+def test_a_standing_robot_that_is_pushed_steps():
+    clock = GaitClock(2)
+    clock.advance(np.repeat(STAND, 2, axis=0), np.array([0.1, 0.6]), np.zeros((2, 4), bool), PERIOD)
+    assert clock.walking.tolist() == [False, True]
 
 
 @pytest.mark.parametrize("late", [-0.1, 0.1])
 def test_touchdowns_of_a_pair_correct_half_of_its_phase_error(late):
     clock = GaitClock(1)
-    clock.phase[:] = late - step_frequency(WALK) * PERIOD
-    clock.advance(WALK, np.array([[True, False, False, True]]), PERIOD)
+    for _ in range(50):
+        advance(clock, WALK)
+    clock.phase[:] = late - step_frequency(clock.velocity) * PERIOD
+    advance(clock, WALK, stepped=np.array([[True, False, False, True]]))
     assert clock.phase[0] == pytest.approx((0.5 * late) % 1.0)
 
 
 def test_a_mirrored_robot_sees_its_clock_with_the_other_sign():
-    clock = GaitClock(2)
-    clock.phase[:] = [0.2, 0.7]
-    one, other = clock.observation(np.repeat(WALK, 2, axis=0))
+    clock = GaitClock(3)
+    clock.phase[:], clock.walking[:] = [0.2, 0.7, 0.2], [True, True, False]
+    one, other, standing = clock.observation()[:, :2]
     assert one == pytest.approx(-other)
-    assert not clock.observation(np.repeat(STAND, 2, axis=0)).any()
+    assert not standing.any()
 
 
 def test_the_scripted_trot_alone_keeps_a_nominal_robot_on_its_feet():
@@ -75,3 +121,30 @@ def test_the_scripted_trot_alone_keeps_a_nominal_robot_on_its_feet():
     kind = GaitKind.of(np.array(contact[50:]), np.zeros(100), PERIOD)
     assert kind.diagonal > 0.9
     assert kind.frequency == pytest.approx(2.175, rel=0.1)
+
+
+COMMANDS = [
+    (0.0, 0.0, 0.0),
+    (0.8, 0.0, 0.0),
+    (-0.5, 0.0, 0.0),
+    (0.0, 0.3, 0.0),
+    (0.0, 0.0, 0.6),
+    (0.3, -0.3, 0.5),
+]
+
+
+def test_the_scripted_trot_alone_stands_and_follows_slow_commands_in_all_directions():
+    n = len(COMMANDS)
+    command = np.concatenate([COMMANDS, np.zeros((n, 1))], axis=1)
+    command[0, 3] = 1.0  # stands
+    config = EnvConfig(n=n, threads=1, period=PERIOD, timestep=0.004, randomisation=Randomisation.none())
+    env = VelocityEnv(attrs.evolve(config, ramped=0.0), FixedCommands(command))
+    past, velocity = Past(env), []
+    for _ in range(150):
+        env.tick(env.stand_q + ACTION_SCALE * total_action(env, past, np.zeros((n, 12))))
+        past.advance(command)
+        velocity.append(np.concatenate([env.velocity[:, :2], env.angular_velocity[:, 2:]], axis=1))
+        assert not env.fallen.any()
+    error = np.mean(velocity[50:], axis=0) - COMMANDS
+    assert np.hypot(error[:, 0], error[:, 1]).max() < 0.2
+    assert np.abs(error[:, 2]).max() < 0.4

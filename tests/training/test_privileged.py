@@ -215,7 +215,7 @@ def test_feet_are_to_step_while_walking_and_to_stay_in_stance():
     env = VelocityEnv(CALM)
     rewards, past = WalkingRewards(env, WalkingWeights()), Past(env)
     command = np.array([[0.5, 0, 0, 0], [0.5, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 1]], float)
-    past.clock.phase[:] = 0.9
+    past.clock.phase[:], past.clock.walking[:] = 0.9, command[:, 3] < 0.5
     env.contact[:] = True
     env.contact[[1, 3], 0] = False
     terms = rewards.terms(command, past, np.zeros((3, 4, 12)))

@@ -46,16 +46,17 @@ def terms(env, past, command=(0.5, 0.0, 0.0, 0.0)):
 
 
 def test_feet_are_paid_for_being_down_and_up_as_the_clock_plans(env, past):
-    past.clock.phase[:] = 0.9  # at 0.5 m/s FR and RL swing, FL and RR stand
+    past.clock.phase[:], past.clock.walking[:] = 0.9, True  # FR and RL swing, FL and RR stand
     env.contact[:] = [(False, True, True, False), (True,) * 4, (True, False, False, True)]
     weight = WalkingWeights().schedule
     assert terms(env, past)["schedule"] == pytest.approx([weight, 0.5 * weight, 0.0])
+    past.clock.walking[:] = False
     assert not terms(env, past, command=(0.0, 0.0, 0.0, 1.0))["schedule"].any()
 
 
 def test_clearance_is_paid_in_the_planned_swing_up_to_a_half_sine(env, past):
-    command = np.array([[0.5, 0.0, 0.0, 0.0]])
-    duty = duty_factor(command)[0]
+    past.clock.velocity[:], past.clock.walking[:] = [0.5, 0.0, 0.0], True
+    duty = duty_factor(past.clock.velocity)[0]
     past.clock.phase[:] = 0.5 * (1.0 + duty)  # FR and RL in the middle of their swing
     env.clearance[:] = [[SWING_CLEARANCE_M] * 4, [0.5 * SWING_CLEARANCE_M] * 4, [9.0] * 4]
     weight = WalkingWeights().lift
@@ -88,6 +89,7 @@ def test_stance_is_fined_at_lift_off_by_how_far_its_middle_is_from_the_hip(env, 
 
 
 def test_sway_is_the_sideways_velocity_off_its_mean_over_a_stride(env, past):
+    past.clock.walking[:] = True
     env.velocity[:, 1] = [0.1, 0.1, 2.0]
     past.stride[:, 1] = [-0.1, 0.0, 0.0]  # the mean over a stride is minus that, as the command is 0
     weight = WalkingWeights().sway
@@ -95,6 +97,7 @@ def test_sway_is_the_sideways_velocity_off_its_mean_over_a_stride(env, past):
 
 
 def test_roll_rate_and_joints_beyond_eight_tenths_of_their_drives_speed_are_fined(env, past):
+    past.clock.walking[:] = True
     env.angular_velocity[:, 0] = [0.0, 2.0, 100.0]
     env.fastest[:] = 0.0
     env.fastest[1] = OVERSPEED_SHARE * ALIENGO.velocity_limit

@@ -1,8 +1,10 @@
-"""Clock of the teacher's trot: when each foot is planned to be on the ground.
+"""Plan of the teacher's trot: its velocity, and when each foot is on the ground.
 
-Diagonal feet have the same phase, the two pairs half a cycle apart. Step frequency and duty factor
-are functions of the command. Touchdowns correct the phase, so that the clock follows the robot, and
-a student without a clock, which imitates the teacher, does not drift away from it.
+Diagonal feet have the same phase, the two pairs half a cycle apart. The planned velocity follows
+the command with a bounded acceleration; step frequency and duty factor are functions of it.
+Touchdowns correct the phase, so that the clock follows the robot, and a student without a clock,
+which imitates the teacher, does not drift away from it. A robot that is told to stand steps until it
+is at rest on four feet; one that is pushed while it stands steps again.
 
 Source of rewards with a clock: Siekmann et al., Sim-to-Real Learning of All Common Bipedal Gaits
 via Periodic Reward Composition (2021); Margolis and Agrawal, Walk These Ways (2022).
@@ -19,83 +21,94 @@ START_PHASE = 0.6  # cycles since touchdown of the pair FR and RL in stance: it 
 CORRECTION = 0.25  # of a touchdown's phase error; the two feet of a pair correct half of it
 SHORTEST_SWING_S = 0.06  # a foot that was in the air for less has not stepped
 YAW_RADIUS_M = 0.3  # yaw rate times this counts as speed of the feet
+ACCELERATION = np.array([4.0, 3.0, 12.0])  # m/s^2, m/s^2, rad/s^2, of the planned velocity
+REST_SPEED = 0.2  # m/s; a slower trunk may stop on four feet
+PUSHED_SPEED = 0.4  # m/s; a standing robot whose trunk is faster steps
 
 
-def foot_pace(command: np.ndarray) -> np.ndarray:
-    """Speed at which a command moves the feet.
+def foot_pace(velocity: np.ndarray) -> np.ndarray:
+    """Speed at which a velocity moves the feet.
 
     Args:
-        command: (n, 4), vx, vy (m/s), yaw rate (rad/s), 1 to stand.
+        velocity: (n, 3 or more), vx, vy (m/s), yaw rate (rad/s).
 
     Returns:
         (n,), m/s.
     """
-    return np.asarray(np.hypot(command[:, 0], command[:, 1]) + YAW_RADIUS_M * np.abs(command[:, 2]))
+    return np.asarray(np.hypot(velocity[:, 0], velocity[:, 1]) + YAW_RADIUS_M * np.abs(velocity[:, 2]))
 
 
-def step_frequency(command: np.ndarray) -> np.ndarray:
+def step_frequency(velocity: np.ndarray) -> np.ndarray:
     """Planned steps of a foot per second.
 
     Args:
-        command: (n, 4).
+        velocity: (n, 3), planned.
 
     Returns:
         (n,), Hz.
     """
     rest, slope, highest = FREQUENCY
-    return np.minimum(rest + slope * foot_pace(command), highest)
+    return np.minimum(rest + slope * foot_pace(velocity), highest)
 
 
-def duty_factor(command: np.ndarray) -> np.ndarray:
+def duty_factor(velocity: np.ndarray) -> np.ndarray:
     """Planned share of a cycle that a foot is on the ground.
 
     Args:
-        command: (n, 4).
+        velocity: (n, 3), planned.
 
     Returns:
         (n,).
     """
     rest, slope, least = DUTY
-    return np.maximum(rest - slope * foot_pace(command), least)
+    return np.maximum(rest - slope * foot_pace(velocity), least)
 
 
 class GaitClock:
-    """Phase of the trot of `n` robots.
+    """Plan of the trot of `n` robots.
 
     Attributes:
         phase: (n,), cycles since the planned touchdown of the feet FR and RL, 0 to 1.
+        velocity: (n, 3), planned: vx, vy (m/s), yaw rate (rad/s).
+        walking: (n,) bool, whether the plan has steps.
     """
 
     def __init__(self, n: int) -> None:
-        """Create the clocks of standing robots.
+        """Create the plans of standing robots.
 
         Args:
             n: number of robots.
         """
-        self.phase = np.full(n, START_PHASE)
+        self.phase, self.velocity = np.full(n, START_PHASE), np.zeros((n, 3))
+        self.walking = np.zeros(n, bool)
 
     def reset(self, ids: np.ndarray) -> None:
-        """Set the clocks of some robots to the start of a walk.
+        """Let some robots stand.
 
         Args:
             ids: their indices.
         """
-        self.phase[ids] = START_PHASE
+        self.phase[ids], self.velocity[ids], self.walking[ids] = START_PHASE, 0.0, False
 
-    def advance(self, command: np.ndarray, stepped: np.ndarray, period: float) -> None:
-        """Advance the clocks of walking robots; those of standing ones wait at the start of a walk.
+    def advance(self, command: np.ndarray, speed: np.ndarray, stepped: np.ndarray, period: float) -> None:
+        """Advance the plans; those of standing robots wait at the start of a walk.
 
         Args:
             command: (n, 4), command that was in force.
+            speed: (n,), m/s, horizontal speed of the trunk.
             stepped: (n, 4) bool, feet that touched the ground after `SHORTEST_SWING_S` or more.
             period: s.
         """
+        reach = ACCELERATION * period
+        self.velocity = self.velocity + np.clip(command[:, :3] - self.velocity, -reach, reach)
         # phase <- phase + f dt - CORRECTION sum_i e_i,  e_i = phase of foot i at its touchdown,
         # within -0.5 and 0.5
-        phase = self.phase + step_frequency(command) * period
+        phase = self.phase + step_frequency(self.velocity) * period
         error = (phase[:, None] + FOOT_PHASES + 0.5) % 1.0 - 0.5
         phase = (phase - CORRECTION * (error * stepped).sum(axis=1)) % 1.0
-        self.phase = np.where(command[:, 3] < 0.5, phase, START_PHASE)
+        self.phase = np.where(self.walking, phase, START_PHASE)
+        at_rest = (speed < REST_SPEED) & ~self.velocity.any(axis=1) & (self.swing_share() < 0.0).all(axis=1)
+        self.walking = np.where(self.walking, ~at_rest, speed > PUSHED_SPEED) | (command[:, 3] < 0.5)
 
     def foot_phases(self, ahead: np.ndarray | float = 0.0) -> np.ndarray:
         """Return the phase of each foot.
@@ -108,29 +121,26 @@ class GaitClock:
         """
         return np.asarray(((self.phase + ahead)[:, None] + FOOT_PHASES) % 1.0)
 
-    def swing_share(self, command: np.ndarray, ahead: np.ndarray | float = 0.0) -> np.ndarray:
+    def swing_share(self, ahead: np.ndarray | float = 0.0) -> np.ndarray:
         """Return how much of each foot's planned swing is over.
 
         Args:
-            command: (n, 4).
             ahead: (n,), cycles added to the phase.
 
         Returns:
             (n, 4), 0 at lift-off to 1 at touchdown; negative while the foot is planned to be down.
         """
-        duty = duty_factor(command)[:, None]
+        duty = duty_factor(self.velocity)[:, None]
         return np.asarray((self.foot_phases(ahead) - duty) / (1.0 - duty))
 
-    def observation(self, command: np.ndarray) -> np.ndarray:
-        """Return what the teacher sees of its clock.
+    def observation(self) -> np.ndarray:
+        """Return what the teacher sees of its plan.
 
-        A mirrored robot has the clock half a cycle later: both numbers change sign.
-
-        Args:
-            command: (n, 4).
+        A mirrored robot has the clock half a cycle later: sine and cosine change sign.
 
         Returns:
-            (n, 2): sine and cosine of the phase; 0 while standing.
+            (n, 5): sine and cosine of the phase, 0 while standing; planned velocity.
         """
         angle = 2.0 * np.pi * self.phase
-        return np.stack([np.sin(angle), np.cos(angle)], axis=1) * (command[:, 3:] < 0.5)
+        phase = np.stack([np.sin(angle), np.cos(angle)], axis=1) * self.walking[:, None]
+        return np.concatenate([phase, self.velocity], axis=1)

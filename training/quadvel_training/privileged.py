@@ -66,11 +66,12 @@ MIRROR = symmetry.concatenate_mirrors(
         symmetry.FEET,  # friction
         _signs(1),  # payload
         _signs(1, -1, 1),  # shift of the centre of mass
-        _signs(-1, -1),  # clock
+        _signs(-1, -1),  # phase of the steps
+        _PLANAR,  # planned velocity
     ]
 )
 OBSERVATION_SIZE = len(MIRROR.index)
-STATE_SIZE = OBSERVATION_SIZE - 2  # without the clock
+STATE_SIZE = OBSERVATION_SIZE - 5  # without the plan
 CRITIC_EXTRA_SIZE = 4 + 4 + 1
 
 
@@ -129,7 +130,8 @@ class Past:
         self.lasting += (error - self.lasting) * settled * period / LASTING_S
         self.lasting[env.changed] = self._age[env.changed] = 0.0
         self._advance_stances()
-        self.clock.advance(command, env.contact & (self.air >= SHORTEST_SWING_S), period)
+        speed = np.hypot(env.velocity[:, 0], env.velocity[:, 1])
+        self.clock.advance(command, speed, env.contact & (self.air >= SHORTEST_SWING_S), period)
         self.air = np.where(env.contact, 0.0, self.air + period)
         self.down = np.where(env.contact, self.down + period, 0.0)
 
@@ -208,7 +210,7 @@ def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
     Returns:
         (n, OBSERVATION_SIZE), scaled to about 1.
     """
-    clock = past.clock.observation(env.command).astype(np.float32)
+    clock = past.clock.observation().astype(np.float32)
     return np.concatenate([observe_state(env, past, previous), clock], axis=1)
 
 

@@ -189,7 +189,7 @@ class WalkingRewards:
         Returns:
             Weighted rewards by name, (n,) each.
         """
-        walking = command[:, 3] < 0.5
+        walking = past.clock.walking
         terms = self._tracking(command, past) | self._body(command, actions)
         on_feet = self._feet(command, past) | self._gait(command, past)
         terms |= {name: value * walking for name, value in on_feet.items()}
@@ -243,7 +243,7 @@ class WalkingRewards:
         env, w = self.env, self.weights
         speed = np.hypot(env.foot_velocity[..., 0], env.foot_velocity[..., 1])
         # swing share s: below 0 in the planned stance; wanted clearance: SWING_CLEARANCE_M sin(pi s)
-        share = past.clock.swing_share(command)
+        share = past.clock.swing_share()
         wanted = SWING_CLEARANCE_M * np.sin(np.pi * np.maximum(share, 0.0))
         lifted = np.clip(np.minimum(env.clearance, wanted), 0.0, None) / SWING_CLEARANCE_M
         return {
