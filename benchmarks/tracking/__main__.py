@@ -16,6 +16,8 @@ import typer
 from rich.console import Console
 
 from benchmarks.tracking.entry import SIZES, entries_table, make_entry, read_entries
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_eval.cli import ClusterOption, walk_progress_bar
 from quadvel_eval.paper.section import Study
 from quadvel_eval.paper.study import Progress
@@ -35,6 +37,7 @@ def enter(
     name: Annotated[str, typer.Argument(help="Name of the entry: letters, digits, dashes, underscores.")],
     policy: Annotated[Path, typer.Argument(metavar="<file>", help="ONNX file of the policy.")],
     size: SizeOption = "small",
+    robot: Annotated[str, typer.Option(metavar="<name|file>", help="The policy's robot.")] = DEFAULT_ROBOT,
     estimator: Annotated[
         Literal["learned", "kalman", "truth"], typer.Option(help="Velocity estimator in the loop.")
     ] = "learned",
@@ -44,8 +47,8 @@ def enter(
     """Measure a policy, and write its entry. An interrupted run continues where it stopped."""
     if not re.fullmatch(r"[\w-]+", name):
         raise typer.BadParameter(f"name: found {name!r}, expected letters, digits, dashes, underscores")
-    PolicyFile(policy)  # fail on a bad file here, once, before any run
-    study = Study(policies={name: policy}, estimator=estimator, seeds=SIZES[size].seeds)
+    PolicyFile(load_robot(robot), policy)  # fail on a bad file here, once, before any run
+    study = Study(robot=robot, policies={name: policy}, estimator=estimator, seeds=SIZES[size].seeds)
     with walk_progress_bar() as bar:
         task = bar.add_task("walks", total=None)
 

@@ -14,6 +14,7 @@ from benchmarks.identification import contest, entrants, judge
 from quadvel_actuator import ActuatorParameters, DelayPair
 from quadvel_sysid.data.plain_model import fit_eam
 from quadvel_sysid.data.signals import Samples
+from tests.helpers.robots import ALIENGO
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +72,7 @@ def test_an_actuator_model_run_on_a_log_gives_the_torque_of_the_plain_model(fold
     eam = fit_eam(samples, np.repeat(shared.known[:, None], len(shared.log.joints), axis=1), windows=(0.0,))
     kp, kd = (float(np.median(gains)) for gains in (shared.log.kp, shared.log.kd))
     parameters = attrs.evolve(
-        ActuatorParameters.default(),
+        ActuatorParameters.of(ALIENGO),
         kp_ref=kp,
         kd_ref=kd,
         delta_kp=kp * (float(eam.gains[0, 0]) - 1.0),

@@ -9,7 +9,6 @@ import pytest
 
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
-from quadvel_driver.aliengo import ALIENGO
 from quadvel_driver.board_state import BoardState
 from quadvel_driver.decimator import Decimator
 from quadvel_driver.link import Link
@@ -21,8 +20,9 @@ from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.loop import SimulationLoop
-from quadvel_sim.simulator import Simulator
+from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.udp_board import UdpBoard
+from tests.helpers.robots import ALIENGO
 
 
 class StandingRobot:
@@ -31,7 +31,7 @@ class StandingRobot:
     def __init__(self) -> None:
         self.now = 100.0  # s
         self._board = UdpBoard(("127.0.0.1", 0), NetworkConfig(), clock=self._clock)
-        simulator = Simulator()
+        simulator = Simulator(SimulatorConfig(robot=ALIENGO))
         simulator.reset("stand")
         self._loop = SimulationLoop(
             simulator, self._board.publish, period=1, answer_timeout=0.0, clock=self._clock
@@ -42,7 +42,9 @@ class StandingRobot:
         self._transport = UdpTransport(config)
         self._link = Link(ALIENGO, wire, self._transport, config, self._on_state, clock=self._clock)
         self._decimator = Decimator(RATE_HZ)
-        self.supervisor = Supervisor(PolicyFile(), SupervisorConfig(), KalmanEstimator())
+        self.supervisor = Supervisor(
+            ALIENGO, PolicyFile(ALIENGO), SupervisorConfig(), KalmanEstimator(ALIENGO)
+        )
         self._control = ControlLoop(
             self.supervisor, ControlConfig(), self._submit, self._clock, steady=self._clock
         )

@@ -134,11 +134,15 @@ def test_it_reports_the_mode_that_each_motor_was_asked_for(serve: Serve) -> None
 
 def test_of_commands_that_waited_during_a_stall_the_newest_is_executed_at_once() -> None:
     board = UdpBoard(("127.0.0.1", 0), NetworkConfig())
-    board.loop = SimulationLoop(Simulator(SimulatorConfig(robot=ALIENGO)), board.publish, period=1, answer_timeout=0.0)
+    board.loop = SimulationLoop(
+        Simulator(SimulatorConfig(robot=ALIENGO)), board.publish, period=1, answer_timeout=0.0
+    )
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.connect(board.address)
         for kp in range(100):
-            client.send(wire.encode_command(JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, float(kp)))))
+            client.send(
+                wire.encode_command(JointCommand(q=np.array(ALIENGO.nominal_q), kp=np.full(12, float(kp))))
+            )
         command = board.receive()
     assert command is not None
     np.testing.assert_array_equal(command.kp, 99.0)

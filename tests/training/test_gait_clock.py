@@ -137,7 +137,9 @@ def test_the_scripted_trot_alone_stands_and_follows_slow_commands_in_all_directi
     n = len(COMMANDS)
     command = np.concatenate([COMMANDS, np.zeros((n, 1))], axis=1)
     command[0, 3] = 1.0  # stands
-    config = EnvConfig(n=n, threads=1, period=PERIOD, timestep=0.004, randomisation=Randomisation.none())
+    config = EnvConfig(
+        robot=ALIENGO, n=n, threads=1, period=PERIOD, timestep=0.004, randomisation=Randomisation.none()
+    )
     env = VelocityEnv(attrs.evolve(config, ramped=0.0), FixedCommands(command))
     past, velocity = Past(env), []
     for _ in range(150):

@@ -63,7 +63,7 @@ def test_a_run_keeps_what_it_is_and_how_it_fared(tmp_path, monkeypatch, drives):
 
 def test_actuators_of_some_joints_are_refused_before_training(tmp_path, drives):
     some = ("FR_hip_joint", "FR_thigh_joint", "FR_calf_joint")
-    attrs.evolve(ActuatorParameters.load(drives), joints=some, effects=()).save(drives)
+    attrs.evolve(ActuatorParameters.load(ALIENGO, drives), joints=some, effects=()).save(drives)
     start = tmp_path / "start.pt"
     start.touch()
     arguments = ["tune", "--actuator", str(drives), "--policy", str(start), "--out", str(tmp_path / "out")]

@@ -52,7 +52,9 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
     # way of a foot at (x, y) in a stance of duty / f: (vx - w y, vy + w x) duty / f,
     # w = w_planned - YAW_GAIN (w_z - w_planned)
     sweep = planned - [0.0, 0.0, YAW_GAIN] * turning[:, None]
-    way = (sweep[:, None, :2] + _turned(below, sweep[:, 2])) * (duty / frequency)[:, None, None]  # (n, 4, 2), m
+    way = (sweep[:, None, :2] + _turned(below, sweep[:, 2])) * (duty / frequency)[
+        :, None, None
+    ]  # (n, 4, 2), m
     way *= np.minimum(1.0, LONGEST_STEP_M / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
     # place on the way, from 1 to -1 in stance and back in swing: 1 - 2 phase / duty, -cos(pi s)
     along = np.where(down, 1.0 - 2.0 * phases / duty[:, None], -np.cos(np.pi * swing))
