@@ -28,7 +28,6 @@ from quadvel_eval.report import read_json, write_json
 
 SCHEMA = 1
 ENTRY_FILE = "entry.json"
-ROBOT = "aliengo"
 JUDGED_CODE = ("src", "benchmarks/tracking")
 """Folders whose last commit an entry names."""
 LIBRARIES = ("quadvel-core", "mujoco", "numpy", "onnxruntime")
@@ -109,7 +108,7 @@ def make_entry(
     entry = {
         "schema": SCHEMA,
         "name": name,
-        "robot": ROBOT,
+        "robot": study.robot,
         "size": size,
         "seeds": list(range(study.seeds)),
         "policy": made_with["policies"][name],
