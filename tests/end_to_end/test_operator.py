@@ -178,7 +178,9 @@ def test_status_shows_nodes_mode_rates_and_files_on_one_page(up: Robot) -> None:
 def test_the_doctor_says_which_actuator_model_runs(up: Robot) -> None:
     code, text = quadvel("doctor")
     assert code == 0, text
-    assert "running: command_mux, controller, estimator, sim_node; policy the shipped one" in text, text
+    assert (
+        "running: command_mux, controller, estimator, sim_node; robot aliengo, policy the shipped one" in text
+    ), text
     assert "actuator the shipped AlienGo (Table 4)" in text
 
 

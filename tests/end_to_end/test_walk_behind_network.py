@@ -56,6 +56,7 @@ class BehindNetwork:
     def __init__(self, network: NetworkConfig, packets: Any) -> None:
         self._packets = packets
         self._simulator = Simulator(SimulatorConfig(robot=ALIENGO))
+        self.config = self._simulator.config
         self._simulator.reset("stand")
         self._there, self._back = BadNetwork(network, 0), BadNetwork(network, 1)
         self._wire = Wire()

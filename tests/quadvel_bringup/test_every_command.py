@@ -25,6 +25,7 @@ import typer
 from quadvel_bringup import cli
 from quadvel_bringup.__main__ import main
 from quadvel_eval.grid import SCHEMA
+from tests.quadvel_sysid.joint_logs import fields, mcap
 
 COMMANDS = tuple(typer.main.get_group(cli.app).commands)
 LONGEST = 60  # s, in which a command has to see what is wrong with its arguments
@@ -255,7 +256,7 @@ def suffixes(place: Place) -> tuple[str, ...]:
         )
     if place.option in ("first", "second", "--after"):
         return (".json",)
-    return (".xml", ".urdf") if place.option == "--robot" else (".yaml",)
+    return (".xml", ".urdf", ".yaml") if place.option == "--robot" else (".yaml",)
 
 
 READ = [
@@ -274,6 +275,8 @@ def test_a_file_that_is_not_what_it_should_be_is_refused(
 ) -> None:
     path = tmp_path / f"given{suffix}"
     make(path)
+    if place.command == "replay":
+        mcap(tmp_path / "walk.mcap", fields(seconds=0.2))
     before = sorted(tmp_path.iterdir())
     value = f"mine={path}" if "=" in metavar_of(place) else str(path)
     is_refused(quadvel(*place.line(value)), path.name)

@@ -61,10 +61,11 @@ def calibrate_command(
       quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml
       quadvel run driver --ros-args -p calibration:=calibration.yaml
     """
+    chosen = load_robot(robot)
     if hung is None and standing is None:
         raise ValueError("no recording given: name one with --hung, with --standing, or both")
     output_file(out)
-    found = fit_calibration(load_robot(robot), _samples(hung), _samples(standing))
+    found = fit_calibration(chosen, _samples(hung), _samples(standing))
     console = Console(soft_wrap=True)
     console.print(_table(found))
     if standing is not None:

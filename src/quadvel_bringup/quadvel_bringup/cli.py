@@ -234,8 +234,11 @@ def doctor(
       quadvel doctor
       quadvel doctor --report
     """
+    from quadvel_description.robot import load_robot
+
     from . import doctor
 
+    load_robot(robot)
     if report:
         print(doctor.report([*doctor.examine()]))
         return

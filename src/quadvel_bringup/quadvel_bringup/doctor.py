@@ -101,9 +101,9 @@ def _robot() -> Finding:
             True,
             f"none runs; `quadvel up` uses the shipped actuator model (Table 4); {discovery_hint()}",
         )
-    files = [
+    files = dict.fromkeys(  # each once, though several nodes report the robot
         f"{key} {node.values[key]}" for node in nodes.values() for key in FILE_KEYS if key in node.values
-    ]
+    )
     return Finding(
         "robot", True, f"running: {', '.join(nodes)}; {', '.join(files) or 'no node reports its files'}"
     )

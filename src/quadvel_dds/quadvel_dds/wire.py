@@ -254,7 +254,7 @@ class Writer:
         Returns:
             Cyclone's descriptions of the readers.
         """
-        found = (self.dds.get_matched_subscription_data(h) for h in self.dds.get_matched_subscriptions())
+        found = (self.dds.get_matched_subscription_data(handle) for handle in self._matched())
         return [reader for reader in found if reader is not None]
 
     def count(self) -> int:
@@ -263,7 +263,15 @@ class Writer:
         Returns:
             Number of readers.
         """
-        return len(self.dds.get_matched_subscriptions())
+        return len(self._matched())
+
+    def _matched(self) -> list[int]:
+        """Return Cyclone's handles of the readers that receive the samples."""
+        while True:
+            with contextlib.suppress(
+                IndexError
+            ):  # Cyclone asks for their number first; meanwhile one more may come
+                return self.dds.get_matched_subscriptions()
 
     def close(self) -> None:
         """Delete the writer."""

@@ -17,7 +17,7 @@ from rich.table import Table
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.arrays import Array
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import Robot, robot_of_file
+from quadvel_description.robot import Robot, load_robot, robot_of_file
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import LearnedEstimator
@@ -250,6 +250,8 @@ def replay_command(
     To see a recording in 3-D: quadvel view walk.mcap
     """
     output_folder(out)
+    if robot is not None:
+        load_robot(robot)
     run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording))
     chosen = robot_of_file(recording, None if run.robot is None else run.robot.name, robot)
     model = ActuatorParameters.of(chosen) if actuator is None else ActuatorParameters.load(chosen, actuator)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from importlib import import_module
 from typing import Any
@@ -69,6 +70,7 @@ class View(Node):
     """The operator page with its subscriptions, publishers and service clients."""
 
     def __init__(self) -> None:
+        self._ends = ExitStack()  # closes what is open when the node is destroyed, even half made
         super().__init__("view")
         settings = read_parameters(self, ViewParameters)
         robot = load_robot(settings.robot)
@@ -76,6 +78,7 @@ class View(Node):
         self._pending: dict[str, deque[bytes]] = {}
         self._status_text, self._stop_sent_at = "", 0.0
         self._recording = PageRecorder(settings.record_folder)
+        self._ends.callback(self._recording.close)
         self._velocity = self.create_publisher(Twist, "cmd_vel_teleop", 10)
         self._set_mode = self.create_client(SetMode, "controller/set_mode")
         self._enable = self.create_client(SetBool, "controller/enable_walking")
@@ -88,6 +91,7 @@ class View(Node):
             self._viewer = Viewer(robot, settings.host, settings.port, self._on_message, self._on_disconnect)
         except AddressError as error:
             raise StartError(str(error)) from None
+        self._ends.callback(self._viewer.close)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(FRAME_PERIOD_S, self._draw, clock=steady)
         self.create_timer(PUBLISH_PERIOD_S, self._publish_velocity, clock=steady)
@@ -95,8 +99,7 @@ class View(Node):
 
     def destroy_node(self) -> None:
         """Stop the page and the recorder, then destroy the node."""
-        self._viewer.close()
-        self._recording.close()
+        self._ends.close()
         super().destroy_node()
 
     def _subscribe(self, topic: str, typename: str) -> None:
