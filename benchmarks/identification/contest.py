@@ -58,7 +58,7 @@ class SharedLog:
 
 
 def publish(size: str, seed: int, folder: Path, logs_of_each_kind: int = 1) -> list[Path]:
-    """Make the logs of a contest, in an order that tells nothing about their kind.
+    """Make the logs of a contest, in an order that does not reveal their kind.
 
     Args:
         size: Key of KINDS.

@@ -118,7 +118,7 @@ def friction_pd(shared: SharedLog) -> Answer:
     """A PD law of each joint with Coulomb and viscous friction.
 
     tau = kp q_des(t - d) - kp' q - (kd + b) dq - c tanh(dq / w) + offset, for the best delay d. The
-    viscous friction b cannot be told from kd, so that only Coulomb friction is named.
+    viscous friction b cannot be separated from kd, so that only Coulomb friction is named.
     """
     log, known = shared.log, shared.known
     laws = [_friction_law(log, j, known) for j in range(len(log.joints))]

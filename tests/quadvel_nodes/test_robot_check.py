@@ -1,4 +1,4 @@
-"""A node that is meant for another robot than the one on the topics ends with a sentence."""
+"""A node of another robot than the one on the topics ends with a sentence."""
 
 from __future__ import annotations
 

@@ -3,8 +3,8 @@
 Diagonal feet have the same phase, the two pairs half a cycle apart. The planned velocity follows
 the command with a bounded acceleration; step frequency and duty factor are functions of it.
 Touchdowns correct the phase, so that the clock follows the robot, and a student without a clock,
-which imitates the teacher, does not drift away from it. A robot that is told to stand steps until it
-is at rest on four feet; one that is pushed while it stands steps again.
+which imitates the teacher, does not drift away from it. A robot that is commanded to stand
+steps until it is at rest on four feet; one that is pushed while it stands steps again.
 
 Source of rewards with a clock: Siekmann et al., Sim-to-Real Learning of All Common Bipedal Gaits
 via Periodic Reward Composition (2021); Margolis and Agrawal, Walk These Ways (2022).

@@ -267,10 +267,10 @@ class Writer:
 
     def _matched(self) -> list[int]:
         """Return Cyclone's handles of the readers that receive the samples."""
+        # Cyclone's Python layer asks for their number, then for the handles: if a reader appears in
+        # between, it raises IndexError.
         while True:
-            with contextlib.suppress(
-                IndexError
-            ):  # Cyclone asks for their number first; meanwhile one more may come
+            with contextlib.suppress(IndexError):
                 return self.dds.get_matched_subscriptions()
 
     def close(self) -> None:

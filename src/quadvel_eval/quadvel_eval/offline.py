@@ -251,7 +251,7 @@ def replay_command(
     """
     output_folder(out)
     if robot is not None:
-        load_robot(robot)
+        load_robot(robot)  # a wrong one is refused before the recording is read
     run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording))
     chosen = robot_of_file(recording, None if run.robot is None else run.robot.name, robot)
     model = ActuatorParameters.of(chosen) if actuator is None else ActuatorParameters.load(chosen, actuator)
