@@ -150,3 +150,22 @@ def test_the_scripted_trot_alone_stands_and_follows_slow_commands_in_all_directi
     error = np.mean(velocity[50:], axis=0) - COMMANDS
     assert np.hypot(error[:, 0], error[:, 1]).max() < 0.2
     assert np.abs(error[:, 2]).max() < 0.4
+
+
+def test_the_scripted_trot_alone_runs():
+    speeds = np.array([1.5, 2.0, 2.5])  # m/s
+    command = np.zeros((3, 4))
+    command[:, 0] = speeds
+    config = EnvConfig(
+        robot=ALIENGO, n=3, threads=1, period=PERIOD, timestep=0.004, randomisation=Randomisation.none()
+    )
+    env = VelocityEnv(attrs.evolve(config, ramped=0.0), FixedCommands(command))
+    past, velocity, height = Past(env), [], []
+    for _ in range(200):
+        env.tick(env.stand_q + ACTION_SCALE * total_action(env, past, np.zeros((3, 12))))
+        past.advance(command)
+        velocity.append(env.velocity[:, 0].copy())
+        height.append(env.height.copy())
+        assert not env.fallen.any()
+    assert (np.mean(velocity[100:], axis=0) > 0.75 * speeds).all()
+    assert np.abs(np.mean(height[100:], axis=0) - 0.37).max() < 0.04
