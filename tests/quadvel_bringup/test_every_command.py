@@ -45,6 +45,7 @@ NEEDED = {
     ("people", "--out"): ["--runs", "0"],
     "plot": ["walk.mcap"],
     "replay": ["walk.mcap"],
+    "robot": ["check", "robot.xml"],
     "run": ["sim_node"],
     "twin": ["dry_gears"],
     "why": [LOG],
@@ -256,6 +257,8 @@ def suffixes(place: Place) -> tuple[str, ...]:
         )
     if place.option in ("first", "second", "--after"):
         return (".json",)
+    if place.command == "robot":
+        return (".xml", ".urdf")
     return (".xml", ".urdf", ".yaml") if place.option == "--robot" else (".yaml",)
 
 

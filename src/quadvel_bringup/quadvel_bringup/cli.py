@@ -19,13 +19,7 @@ from .installation import check_installed
 from .nodes import NODES
 from .stack import PARAMETERS, Stack
 
-ROBOT, SIMULATOR, LOGS, EVALUATION, EXPERIMENTS = PANELS = (
-    "Robot",
-    "Simulator",
-    "Logs",
-    "Evaluation",
-    "Experiments",
-)
+ROBOT, SIMULATOR, LOGS, EVALUATION = PANELS = ("Robot", "Simulator", "Logs", "Evaluation")
 """Panels of the help, in order."""
 EXAMPLES = """\
 Usage: quadvel COMMAND [ARGS]...   For example:
@@ -93,6 +87,12 @@ class DelegatedCommand:
 
 
 DELEGATED_COMMANDS = {
+    "robot": DelegatedCommand(
+        "quadvel_eval.robot_check:robot_command",
+        "eval",
+        ROBOT,
+        "Check the MJCF or URDF of a new quadruped.",
+    ),
     "demo": DelegatedCommand(
         "quadvel_lab.demo:demo_command",
         "eval",
@@ -180,13 +180,13 @@ DELEGATED_COMMANDS = {
     "paper": DelegatedCommand(
         "quadvel_eval.paper.cli:paper_command",
         "eval",
-        EXPERIMENTS,
+        EVALUATION,
         "Reproduce the figures of the paper: page, plots, tables.",
     ),
     "twin": DelegatedCommand(
         "quadvel_lab.ground_truth_benchmark:twin_command",
         "eval",
-        EXPERIMENTS,
+        EVALUATION,
         "Benchmark the identification on plants with hidden effects.",
     ),
 }
