@@ -108,6 +108,15 @@ def test_a_set_of_operators_that_no_node_uses_is_harmless(tmp_path: Path) -> Non
         read_network(tmp_path / "bad.onnx")
 
 
+def test_expanding_to_the_shape_of_another_value_is_allowed(tmp_path: Path) -> None:
+    model = network()
+    model.graph.node.extend(
+        [helper.make_node("Shape", ["x"], ["shape"]), helper.make_node("Expand", ["x", "shape"], ["z"])]
+    )
+    onnx.save(model, tmp_path / "good.onnx")
+    read_network(tmp_path / "good.onnx")
+
+
 def test_a_harmless_network_is_read_as_it_is(tmp_path: Path) -> None:
     onnx.save(network(), tmp_path / "good.onnx")
     assert serialise(read_network(tmp_path / "good.onnx")) == network().SerializeToString()
@@ -119,7 +128,10 @@ def test_a_harmless_network_is_read_as_it_is(tmp_path: Path) -> None:
         (weights_elsewhere, "tensor 'W' lies in another file, expected all data in this one"),
         (constant_elsewhere, "tensor 'c' lies in another file"),
         (operator("Loop"), "operator 'Loop' of node 'product' is not one of those that are run: Abs Acos"),
-        (operator("Expand"), "operator 'Expand'"),
+        (
+            operator("Expand"),
+            "operator 'Expand' of node 'product' expands to .'W'., expected the output of a Shape",
+        ),
         (branch, "operator 'If'"),
         (from_elsewhere, "operators come from the sets ai.onnx 17, com.evil 1, expected ai.onnx 11 to 21"),
         (lambda model: setattr(model.graph.node[0], "domain", "com.evil"), "operator 'com.evil.MatMul'"),

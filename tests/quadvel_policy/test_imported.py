@@ -17,16 +17,18 @@ import onnx
 import pytest
 import yaml
 from onnx import TensorProto, helper, numpy_helper
-from typer.testing import CliRunner
 
 from quadvel_description.kinematics import rotate
 from quadvel_description.network_file import NetworkFileError
 from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot import Robot
 from quadvel_description.state import JointCommand, RobotState
-from quadvel_policy.imported.importer import Supplement, import_policy
+from quadvel_eval.walk import Setup, make_loop, record_until_fall
+from quadvel_policy.imported.importer import Supplement
+from quadvel_policy.imported.importer import import_policy as read_policy
+from quadvel_policy.imported.metadata import ImportedMetadata
 from quadvel_policy.imported.policy import ImportedPolicy
 from quadvel_policy.modes import ModeInput, Walk
-from quadvel_policy.policy_command import app
 from quadvel_policy.policy_file import PolicyFile, load_policy
 from tests.helpers.robots import ALIENGO, GO2
 
@@ -135,6 +137,15 @@ def write_yaml(path: Path, content: object) -> Path:
 def write_rl_sar(folder: Path, config: Mapping[str, Any] = CONFIG, base: Mapping[str, Any] = BASE) -> Path:
     write_yaml(folder / "go2" / "base.yaml", {"go2": dict(base)})
     return write_yaml(folder / "go2" / "mine" / "config.yaml", {"go2/mine": dict(config)})
+
+
+def import_policy(
+    robot: Robot, weights: Path, config: Path | None, out: Path, supplement: Supplement | None = None
+) -> ImportedMetadata:
+    """Import into a file."""
+    metadata, content = read_policy(robot, weights, config, supplement)
+    out.write_bytes(content)
+    return metadata
 
 
 def some_walk(ticks: int = 24) -> list[ModeInput]:
@@ -429,12 +440,29 @@ def test_a_network_that_does_not_fit_its_file_is_refused(
     write_network(weights, **changes)
     with pytest.raises(NetworkFileError, match=rf"policy\.onnx: {sentence}"):
         import_policy(GO2, weights, write_yaml(tmp_path / "deploy.yaml", DEPLOY), tmp_path / "out.onnx")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["deploy.yaml", "policy.onnx"]
 
 
 def test_torchscript_is_refused_unopened(tmp_path: Path) -> None:
     with pytest.raises(NetworkFileError, match=r"policy\.pt: is TorchScript, .* expected ONNX"):
         import_policy(GO2, tmp_path / "policy.pt", None, tmp_path / "out.onnx")
+
+
+def test_a_policy_that_holds_its_posture_stands_in_the_loop(tmp_path: Path) -> None:
+    """With a network of zeros, and the supervisor, the guards and the filter of our own policies."""
+    path, out = tmp_path / "policy.onnx", tmp_path / "out.onnx"
+    write_network(path, 75)
+    model = onnx.load(path)
+    model.graph.initializer[0].raw_data = bytes(len(model.graph.initializer[0].raw_data))
+    onnx.save(model, path)
+    deploy = changed(DEPLOY, "stiffness", 40.0)
+    import_policy(GO2, path, write_yaml(tmp_path / "deploy.yaml", deploy), out)
+    loop = make_loop(Setup(robot="go2", policy=out, estimator="kalman"), 0, ())
+    walk, stood = record_until_fall(loop, [((0.0, 0.0, 0.0), 1.0)])
+    assert stood, loop.supervisor.reason
+    assert walk is not None
+    posture = dict(zip(motors(LEFT_FIRST), POSTURE, strict=True))
+    np.testing.assert_allclose(walk.targets[-1], [posture[name] for name in JOINT_NAMES], atol=1e-6)
+    assert np.abs(walk.velocity[-1]).max() < 0.02
 
 
 def test_a_network_without_configuration_is_refused(tmp_path: Path) -> None:
@@ -478,13 +506,3 @@ def test_changed_metadata_are_refused_by_field(
     onnx.save(model, imported)
     with pytest.raises(NetworkFileError, match=rf"out\.onnx: .*{sentence}"):
         load_policy(GO2, imported)
-
-
-def test_the_command_imports_and_says_what_it_read(tmp_path: Path) -> None:
-    write_network(tmp_path / "policy.onnx", 75)
-    config, out = write_yaml(tmp_path / "deploy.yaml", DEPLOY), tmp_path / "new" / "go2.onnx"
-    asked = ["import", str(tmp_path / "policy.onnx"), "--with", str(config), "--out", str(out)]
-    result = CliRunner().invoke(app, asked)
-    assert result.exit_code == 0, result.output
-    assert "75 numbers at 50 Hz: angular_velocity x 3" in result.output
-    assert load_policy(GO2, out).metadata.robot == "go2"

@@ -19,13 +19,7 @@ from .installation import check_installed
 from .nodes import NODES
 from .stack import PARAMETERS, Stack
 
-ROBOT, SIMULATOR, LOGS, EVALUATION, EXPERIMENTS = PANELS = (
-    "Robot",
-    "Simulator",
-    "Logs",
-    "Evaluation",
-    "Experiments",
-)
+ROBOT, SIMULATOR, LOGS, EVALUATION = PANELS = ("Robot", "Simulator", "Logs", "Evaluation")
 """Panels of the help, in order."""
 EXAMPLES = """\
 Usage: quadvel COMMAND [ARGS]...   For example:
@@ -100,7 +94,7 @@ DELEGATED_COMMANDS = {
         "Walk a simulated robot in all directions, or after a person.",
     ),
     "policy": DelegatedCommand(
-        "quadvel_policy.policy_command:app",
+        "quadvel_bringup.import_policy:app",
         "robot",
         ROBOT,
         "Import a policy of another project into one ONNX file.",
@@ -186,13 +180,13 @@ DELEGATED_COMMANDS = {
     "paper": DelegatedCommand(
         "quadvel_eval.paper.cli:paper_command",
         "eval",
-        EXPERIMENTS,
+        EVALUATION,
         "Reproduce the figures of the paper: page, plots, tables.",
     ),
     "twin": DelegatedCommand(
         "quadvel_lab.ground_truth_benchmark:twin_command",
         "eval",
-        EXPERIMENTS,
+        EVALUATION,
         "Benchmark the identification on plants with hidden effects.",
     ),
 }

@@ -26,12 +26,14 @@ UNUSED_DOMAINS = ("ai.onnx.ml",)
 """Operator sets that exporters name without use; a node of one is refused."""
 
 # Operators of ONNX's own domain. None of them runs a subgraph, draws random numbers, or creates an
-# output whose size is the value of an input.
+# output whose size is the value of an input, but Expand, which is allowed only to the shape of
+# another value.
 ALLOWED_OPERATORS = """
-    Abs Acos Add And Asin Atan Cast Clip Concat Constant Cos Div Elu Equal Erf Exp Flatten Floor GRU Gather Gemm Greater
-    GreaterOrEqual HardSigmoid Identity LSTM LayerNormalization LeakyRelu Less LessOrEqual Log MatMul Max Min Mod Mul Neg
-    Not Or Pow RNN ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum Relu Reshape Round Selu Shape Sigmoid
-    Sign Sin Slice Softmax Softplus Split Sqrt Squeeze Sub Tan Tanh Transpose Unsqueeze Where
+    Abs Acos Add And Asin Atan Cast Clip Concat Constant Conv Cos Div Elu Equal Erf Exp Expand Flatten Floor GRU
+    Gather Gemm Greater GreaterOrEqual HardSigmoid Identity LSTM LayerNormalization LeakyRelu Less LessOrEqual Log
+    MatMul Max Min Mod Mul Neg NonZero Not Or Pow RNN ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum
+    Relu Reshape Round Selu Shape Sigmoid Sign Sin Slice Softmax Softplus Split Sqrt Squeeze Sub Tan Tanh Transpose
+    Unsqueeze Where
     """
 # Message fields of the format; no external data, subgraphs, functions, sparse tensors, training.
 ALLOWED_PARTS = """
@@ -93,6 +95,12 @@ def _find_problems(model: Message) -> Iterator[str]:
     """Yield a sentence for everything that is not allowed."""
     operators, known = ALLOWED_OPERATORS.split(), ALLOWED_PARTS.split()
     parts = list(islice(model.parts(), MAX_PARTS + 1))
+    shapes = {
+        name
+        for _, part in parts
+        if isinstance(part, Message) and part.kind == "NodeProto" and part.one("op_type") == "Shape"
+        for name in part.all("output")
+    }
     if len(parts) > MAX_PARTS:
         yield f"has more than {MAX_PARTS} parts, expected fewer: so many operators are no step of 5 ms"
     opsets = [
@@ -115,6 +123,11 @@ def _find_problems(model: Message) -> Iterator[str]:
                 yield (
                     f"operator {name!r} of node {part.one('name', '')!r} is not one of those that are run: "
                     + " ".join(operators)
+                )
+            elif operator == "Expand" and not shapes.issuperset(part.all("input")[1:]):
+                yield (
+                    f"operator 'Expand' of node {part.one('name', '')!r} expands to {part.all('input')[1:]}, "
+                    "expected the output of a Shape: no size is a number in the file"
                 )
         elif part.kind == "TensorProto":
             yield from _find_tensor_problems(part)

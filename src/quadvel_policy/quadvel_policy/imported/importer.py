@@ -1,4 +1,4 @@
-"""Imports a policy: reads weights and configuration, writes one ONNX file that runs here.
+"""Imports a policy: from weights and configuration to one ONNX file that runs here.
 
 The network stays as it is; only its metadata and its list of operator sets change.
 """
@@ -6,6 +6,7 @@ The network stays as it is; only its metadata and its list of operator sets chan
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import attrs
 
@@ -40,75 +41,81 @@ class Supplement:
 
 
 def import_policy(
-    robot: Robot, weights: Path, config: Path | None, out: Path, supplement: Supplement | None = None
-) -> ImportedMetadata:
-    """Write the file of an imported policy.
+    robot: Robot, weights: Path, config: Path | None = None, supplement: Supplement | None = None
+) -> tuple[ImportedMetadata, bytes]:
+    """Read a policy of another project.
 
     Args:
         robot: The robot of the policy.
-        weights: ONNX file of another project.
+        weights: Its ONNX file.
         config: Its deploy.yaml (unitree_rl_lab) or config.yaml (rl_sar); None: mjlab's metadata in
             the ONNX file.
-        out: File to write.
-        supplement: Values that the format lacks.
+        supplement: Values that the format lacks; None for nothing.
 
     Returns:
-        What was read.
+        What was read, and the content of the ONNX file for `ImportedPolicy`.
 
     Raises:
         ValueError: A file or a field is missing or does not fit; the message names file and field,
             the value found and the value expected.
     """
+    fields = None if config is None else _read_known(config)
     if weights.suffix in PICKLED:
         raise NetworkFileError(
             f"{weights}: is TorchScript, which can run code when it is opened, expected ONNX: convert it "
             "where you trust it, with torch.onnx.export(torch.jit.load(file), torch.zeros(1, n), 'policy.onnx')"
         )
     model = read_network(weights)
-    metadata = _read(robot, weights, model, config, supplement or Supplement())
+    output, supplement = _action_output(weights, model), supplement or Supplement()
+    if config is None:
+        metadata = _read_mjlab(robot, weights, model, output, supplement)
+    else:
+        metadata = _read_config(robot, config, fields, output, supplement)
     _check_posture(robot, config or weights, metadata)
     entry = message("StringStringEntryProto", key=IMPORTED_KEY, value=metadata.to_json())
-    draft = out.with_name(f".{out.name}.part")
-    draft.write_bytes(serialise(attrs.evolve(model, fields=model.fields | {"metadata_props": [entry]})))
-    try:
-        ImportedPolicy(robot, draft)
-        draft.replace(out)
-    except NetworkFileError as error:
-        raise NetworkFileError(str(error).replace(str(draft), str(weights), 1)) from None
-    finally:
-        draft.unlink(missing_ok=True)
-    return metadata
+    model = attrs.evolve(model, fields=model.fields | {"metadata_props": [entry]})
+    ImportedPolicy(robot, weights, model)  # refuses a network that does not fit
+    return metadata, serialise(model)
 
 
-def _read(
-    robot: Robot, weights: Path, model: Message, config: Path | None, supplement: Supplement
-) -> ImportedMetadata:
-    """Recognise the format and read it."""
-    output = _action_output(weights, model)
-    if config is None:
-        metadata = {entry.one("key"): entry.one("value", "") for entry in model.all("metadata_props")}
-        if not mjlab.is_mjlab(metadata):
-            raise FormatError(
-                f"{weights}: metadata: found {sorted(metadata) or 'nothing'}, expected mjlab's "
-                "observation_names and joint_names, or a configuration file (--with)"
-            )
-        limits, rate = _limits(weights, supplement), supplement.rate_hz
-        if rate is None:
-            raise FormatError(f"{weights}: metadata.rate: found nothing, expected a rate in Hz (--rate)")
-        return mjlab.read(weights, metadata, robot.name, output, limits, rate)
+def _read_known(config: Path) -> Any:
+    """Return the content of a configuration file of a known format."""
     fields = read_yaml(config, "a deploy.yaml or a config.yaml")
+    if not unitree_rl_lab.is_deploy_yaml(fields) and not rl_sar.is_config(fields):
+        raise FormatError(
+            f"{config}: found no joint_ids_map and no single key 'robot/policy', expected "
+            "unitree_rl_lab's deploy.yaml or rl_sar's config.yaml"
+        )
+    return fields
+
+
+def _read_mjlab(
+    robot: Robot, weights: Path, model: Message, output: str, supplement: Supplement
+) -> ImportedMetadata:
+    """Read the metadata of the ONNX file."""
+    metadata = {entry.one("key"): entry.one("value", "") for entry in model.all("metadata_props")}
+    if not mjlab.is_mjlab(metadata):
+        raise FormatError(
+            f"{weights}: metadata: found {sorted(metadata) or 'nothing'}, expected mjlab's "
+            "observation_names and joint_names, or a configuration file (--with)"
+        )
+    limits, rate = _limits(weights, supplement), supplement.rate_hz
+    if rate is None:
+        raise FormatError(f"{weights}: metadata.rate: found nothing, expected a rate in Hz (--rate)")
+    return mjlab.read(weights, metadata, robot.name, output, limits, rate)
+
+
+def _read_config(
+    robot: Robot, config: Path, fields: Any, output: str, supplement: Supplement
+) -> ImportedMetadata:
+    """Read the content of a configuration file."""
     if supplement.rate_hz is not None:
         raise FormatError(f"{config}: has its own rate, expected no --rate")
     if unitree_rl_lab.is_deploy_yaml(fields):
         if supplement.limits is not None:
             raise FormatError(f"{config}: commands: has its own ranges, expected no --limits")
         return unitree_rl_lab.read(config, fields, robot.name, output)
-    if rl_sar.is_config(fields):
-        return rl_sar.read(config, fields, robot.name, output, _limits(config, supplement))
-    raise FormatError(
-        f"{config}: found no joint_ids_map and no single key 'robot/policy', expected "
-        "unitree_rl_lab's deploy.yaml or rl_sar's config.yaml"
-    )
+    return rl_sar.read(config, fields, robot.name, output, _limits(config, supplement))
 
 
 def _limits(path: Path, supplement: Supplement) -> dict[str, Bounds]:

@@ -23,18 +23,19 @@ class ImportedPolicy:
         metadata: Terms, joint map, gains, rate and limits.
     """
 
-    def __init__(self, robot: Robot, path: str | Path) -> None:
+    def __init__(self, robot: Robot, path: str | Path, model: Message | None = None) -> None:
         """Load and check a file.
 
         Args:
             robot: The robot that the policy has to belong to.
             path: The ONNX file.
+            model: Its network; None to read it.
 
         Raises:
             NetworkFileError: The file is missing, or is not an imported policy for this robot.
         """
         path = Path(path)
-        model = read_network(path)
+        model = read_network(path) if model is None else model
         text = metadata_text(model)
         if text is None:
             raise NetworkFileError(f"{path}: has no metadata under the key {IMPORTED_KEY!r}, expected them")

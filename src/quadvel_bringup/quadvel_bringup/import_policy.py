@@ -1,4 +1,4 @@
-"""The command `quadvel policy`: policies of other projects."""
+"""The command `quadvel policy import`: a policy of another project becomes one ONNX file."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from quadvel_description.robot import load_robot
-
-from .imported.importer import Supplement, import_policy
+from quadvel_policy.imported.importer import Supplement, import_policy
+from quadvel_recordings.output import atomic_write, output_file
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False
@@ -23,9 +23,7 @@ def begin() -> None:
 
 @app.command("import")
 def import_command(
-    weights: Annotated[
-        Path, typer.Argument(metavar="WEIGHTS", help="ONNX file of the other project.", show_default=False)
-    ],
+    weights: Annotated[Path, typer.Argument(help="ONNX file of the other project.", show_default=False)],
     out: Annotated[Path, typer.Option(metavar="<file>", help="ONNX file to write.")] = Path(
         "out/policy.onnx"
     ),
@@ -42,7 +40,7 @@ def import_command(
     limits: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
-            metavar="VX VY WZ",
+            metavar="<vx vy wz>",
             help="Largest commands of the training, m/s and rad/s, if the format has none.",
             show_default="those of the format",
         ),
@@ -50,7 +48,9 @@ def import_command(
     rate: Annotated[
         float | None,
         typer.Option(
-            help="Rate of the policy, Hz, if the format has none.", show_default="that of the format"
+            metavar="<hz>",
+            help="Rate of the policy, Hz, if the format has none.",
+            show_default="that of the format",
         ),
     ] = None,
 ) -> None:
@@ -63,8 +63,11 @@ def import_command(
       quadvel policy import policy.onnx --with deploy.yaml --out go2.onnx
       quadvel eval --grid quick --robot go2 --policy go2.onnx --estimator kalman
     """
-    out.parent.mkdir(parents=True, exist_ok=True)
-    metadata = import_policy(load_robot(robot), weights, config, out, Supplement(limits=limits, rate_hz=rate))
+    output_file(out)
+    supplement = Supplement(limits=limits, rate_hz=rate)
+    metadata, content = import_policy(load_robot(robot), weights, config, supplement)
+    with atomic_write(out) as draft:
+        draft.write_bytes(content)
     terms = ", ".join(f"{term.name} x {len(term.ages)}" for term in metadata.terms)
     print(f"{metadata.source}: {metadata.size} numbers at {metadata.rate_hz:g} Hz: {terms}")
     print(f"written: {out}")
