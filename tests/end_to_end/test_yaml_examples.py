@@ -14,7 +14,6 @@ import quadvel_dds
 from quadvel_bringup.nodes import NODES
 from quadvel_bringup.preflight import check_stack
 from quadvel_bringup.stack import PARAMETERS, Stack
-from quadvel_policy.imported import unitree_rl_lab
 from quadvel_sysid.logs.readers.columns import ColumnMap
 
 quadvel_dds.install()
@@ -56,15 +55,9 @@ def _as_columns(block: str, folder: Path) -> None:
     ColumnMap.load(file)
 
 
-def _as_deploy_yaml(block: str, folder: Path) -> None:
-    unitree_rl_lab.read(folder / "deploy.yaml", yaml.safe_load(block), "go2", "actions")
-
-
 def _reader(block: str) -> Callable[[str, Path], None]:
     keys: Any = yaml.safe_load(block)
     assert isinstance(keys, dict), f"found {type(keys).__name__}, expected a mapping"
-    if unitree_rl_lab.is_deploy_yaml(keys):
-        return _as_deploy_yaml
     return _as_parameters if keys.keys() <= NODES.keys() else _as_columns
 
 
