@@ -42,10 +42,12 @@ def commands() -> str:
     group = typer.main.get_command(cli.app)
     parts = []
     for name in group.commands:  # type: ignore[attr-defined]
-        shown = CliRunner().invoke(
-            cli.app, [name, "--help"], env={"COLUMNS": str(COLUMNS)}, prog_name="quadvel"
-        )
-        parts.append(f"## quadvel {name}\n\n{_fenced(shown.output, 'text')}")
+        for inner in getattr(cli.command(name), "commands", [""]):
+            words = f"{name} {inner}".split()
+            shown = CliRunner().invoke(
+                cli.app, [*words, "--help"], env={"COLUMNS": str(COLUMNS)}, prog_name="quadvel"
+            )
+            parts.append(f"## quadvel {' '.join(words)}\n\n{_fenced(shown.output, 'text')}")
     return "\n".join(parts)
 
 

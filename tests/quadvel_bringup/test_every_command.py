@@ -27,7 +27,11 @@ from quadvel_bringup.__main__ import main
 from quadvel_eval.grid import SCHEMA
 from tests.quadvel_sysid.joint_logs import fields, mcap
 
-COMMANDS = tuple(typer.main.get_group(cli.app).commands)
+COMMANDS = tuple(
+    f"{name} {inner}".strip()
+    for name in typer.main.get_group(cli.app).commands
+    for inner in getattr(cli.command(name), "commands", [""])
+)
 LONGEST = 60  # s, in which a command has to see what is wrong with its arguments
 NAMES_OR_FILES = {("world", "world"), ("twin", "plants")}
 """Arguments that take the name of something shipped, or a file"""
@@ -44,6 +48,7 @@ NEEDED = {
     ("people", "--scans"): ["--runs", "0"],
     ("people", "--out"): ["--runs", "0"],
     "plot": ["walk.mcap"],
+    "policy import": ["policy.onnx"],
     "replay": ["walk.mcap"],
     "robot": ["check", "robot.xml"],
     "run": ["sim_node"],
@@ -82,20 +87,27 @@ class Place:
         """A command line on which this parameter alone is wrong."""
         needed = NEEDED.get((self.command, self.option), NEEDED.get(self.command, []))
         if not self.is_argument:
-            return [self.command, *needed, self.option, value]
+            return [*self.command.split(), *needed, self.option, value]
         index = [p.name for p in parameters(self.command) if p.param_type_name == "argument"].index(
             self.option
         )
-        return [self.command, *needed[:index], value, *needed[index + 1 :]]
+        return [*self.command.split(), *needed[:index], value, *needed[index + 1 :]]
+
+
+def command(name: str) -> Any:
+    """A command, such as `eval` or `policy import`."""
+    outer, *inner = name.split()
+    found = cli.command(outer)
+    return found.commands[inner[0]] if inner else found
 
 
 def parameters(name: str) -> list[Any]:
-    return cli.command(name).params
+    return list(command(name).params)
 
 
 def types(name: str) -> dict[str, str]:
     """The types of a command's parameters as they are written in its function."""
-    callback = cli.command(name).callback
+    callback = command(name).callback
     assert callback is not None
     return {key: str(hint) for key, hint in typing.get_type_hints(inspect.unwrap(callback)).items()}
 
@@ -173,7 +185,7 @@ def is_refused(ended: Ended, sentence_about: str) -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_is_plain_text(name: str, quadvel: Callable[..., Ended]) -> None:
-    shown = quadvel(name, "--help")
+    shown = quadvel(*name.split(), "--help")
     assert shown.code == 0
     assert re.findall(r"[^\n -~]|\\b", shown.out) == []
 
@@ -247,7 +259,7 @@ WRONG = (missing, folder, empty, garbage, text, list_of_numbers)
 
 def suffixes(place: Place) -> tuple[str, ...]:
     """Names under which a parameter's file may come: readers choose by them."""
-    if "onnx" in place.option or place.option in ("--policy", "--estimator-file", "--model"):
+    if "onnx" in place.option or place.option in ("--policy", "--estimator-file", "--model", "weights"):
         return (".onnx",)
     if place.command in ("identify", "plot", "replay", "calibrate", "view", "why") and place.option in (
         "logs", "--holdout", "recording", "--hung", "--standing"

@@ -99,6 +99,12 @@ DELEGATED_COMMANDS = {
         SIMULATOR,
         "Walk a simulated robot in all directions, or after a person.",
     ),
+    "policy": DelegatedCommand(
+        "quadvel_bringup.import_policy:app",
+        "robot",
+        ROBOT,
+        "Import a policy of another project into one ONNX file.",
+    ),
     "world": DelegatedCommand(
         "quadvel_eval.world_map:world_command",
         "eval",

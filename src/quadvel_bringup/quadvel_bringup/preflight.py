@@ -42,11 +42,11 @@ class NodeCheck:
 
 def _policy(settings: Any) -> object:
     """Check the limits, and load the policy; a shipped one has to exist."""
-    from quadvel_policy.policy_file import PolicyFile, shipped_policy
+    from quadvel_policy.policy_file import load_policy, shipped_policy
 
     robot = load_robot(settings.robot)
     settings.control.supervisor.check(robot)
-    return PolicyFile(robot, settings.policy) if settings.policy else shipped_policy(robot)
+    return load_policy(robot, settings.policy) if settings.policy else shipped_policy(robot)
 
 
 def _estimator(settings: Any) -> object:

@@ -20,16 +20,20 @@ MAX_FILE_BYTES = 16_000_000
 MAX_PARTS = 50_000
 """Largest number of nested messages: nodes, attributes, tensors; the shipped policy has 100."""
 MAX_TENSOR_NUMBERS = MAX_FILE_BYTES // 4
-SUPPORTED_OPSETS = range(13, 22)
-"""From the first opset with axes as inputs to the last one that onnxruntime 1.20 runs."""
+SUPPORTED_OPSETS = range(11, 22)
+"""From the oldest one in public policies to the last one that onnxruntime 1.20 runs."""
+UNUSED_DOMAINS = ("ai.onnx.ml",)
+"""Operator sets that exporters name without use; a node of one is refused."""
 
 # Operators of ONNX's own domain. None of them runs a subgraph, draws random numbers, or creates an
-# output whose size is the value of an input.
+# output whose size is the value of an input, but Expand, which is allowed only to the shape of
+# another value.
 ALLOWED_OPERATORS = """
-    Abs Acos Add And Asin Atan Cast Clip Concat Constant Cos Div Elu Equal Erf Exp Flatten Floor GRU Gather Gemm Greater
-    GreaterOrEqual HardSigmoid Identity LSTM LayerNormalization LeakyRelu Less LessOrEqual Log MatMul Max Min Mod Mul Neg
-    Not Or Pow RNN ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum Relu Reshape Round Selu Shape Sigmoid
-    Sign Sin Slice Softmax Softplus Split Sqrt Squeeze Sub Tan Tanh Transpose Unsqueeze Where
+    Abs Acos Add And Asin Atan Cast Clip Concat Constant Conv Cos Div Elu Equal Erf Exp Expand Flatten Floor GRU
+    Gather Gemm Greater GreaterOrEqual HardSigmoid Identity LSTM LayerNormalization LeakyRelu Less LessOrEqual Log
+    MatMul Max Min Mod Mul Neg NonZero Not Or Pow RNN ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum
+    Relu Reshape Round Selu Shape Sigmoid Sign Sin Slice Softmax Softplus Split Sqrt Squeeze Sub Tan Tanh Transpose
+    Unsqueeze Where
     """
 # Message fields of the format; no external data, subgraphs, functions, sparse tensors, training.
 ALLOWED_PARTS = """
@@ -91,9 +95,19 @@ def _find_problems(model: Message) -> Iterator[str]:
     """Yield a sentence for everything that is not allowed."""
     operators, known = ALLOWED_OPERATORS.split(), ALLOWED_PARTS.split()
     parts = list(islice(model.parts(), MAX_PARTS + 1))
+    shapes = {
+        name
+        for _, part in parts
+        if isinstance(part, Message) and part.kind == "NodeProto" and part.one("op_type") == "Shape"
+        for name in part.all("output")
+    }
     if len(parts) > MAX_PARTS:
         yield f"has more than {MAX_PARTS} parts, expected fewer: so many operators are no step of 5 ms"
-    opsets = [(one.one("domain", ""), one.one("version", 0)) for one in model.all("opset_import")]
+    opsets = [
+        (domain, one.one("version", 0))
+        for one in model.all("opset_import")
+        if (domain := one.one("domain", "")) not in UNUSED_DOMAINS
+    ]
     if len(opsets) != 1 or opsets[0][0] != "" or opsets[0][1] not in SUPPORTED_OPSETS:
         found = ", ".join(f"{domain or 'ai.onnx'} {version}" for domain, version in opsets) or "none"
         yield f"operators come from the sets {found}, expected ai.onnx {SUPPORTED_OPSETS[0]} to {SUPPORTED_OPSETS[-1]} alone"
@@ -109,6 +123,11 @@ def _find_problems(model: Message) -> Iterator[str]:
                 yield (
                     f"operator {name!r} of node {part.one('name', '')!r} is not one of those that are run: "
                     + " ".join(operators)
+                )
+            elif operator == "Expand" and not shapes.issuperset(part.all("input")[1:]):
+                yield (
+                    f"operator 'Expand' of node {part.one('name', '')!r} expands to {part.all('input')[1:]}, "
+                    "expected the output of a Shape: no size is a number in the file"
                 )
         elif part.kind == "TensorProto":
             yield from _find_tensor_problems(part)

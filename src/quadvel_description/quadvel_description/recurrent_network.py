@@ -33,8 +33,12 @@ MEMORY_INPUTS = ("h_in", "c_in")
 MEMORY_OUTPUTS = ("h_out", "c_out")
 
 
-def _session_options() -> onnxruntime.SessionOptions:
-    """Return options of a session that runs on one thread."""
+def single_thread_options() -> onnxruntime.SessionOptions:
+    """Create options of a session that runs on one thread.
+
+    Returns:
+        The options.
+    """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
@@ -223,7 +227,7 @@ class RecurrentNetwork:
         """Return a session of the network or of a part of it."""
         try:
             return onnxruntime.InferenceSession(
-                serialise(model), _session_options(), providers=["CPUExecutionProvider"]
+                serialise(model), single_thread_options(), providers=["CPUExecutionProvider"]
             )
         except Exception as error:  # onnxruntime's exceptions share no other base
             raise NetworkFileError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -12,8 +12,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
-from quadvel_estimator.learned import LearnedEstimator, shipped_estimator
-from quadvel_policy.policy_file import PolicyFile, shipped_policy
+from quadvel_estimator.learned import LearnedEstimator
+from quadvel_policy.policy_file import load_policy, shipped_policy
 from quadvel_recordings.output import output_file, output_folder
 
 from . import bench
@@ -72,17 +72,19 @@ def eval_command(
 ) -> None:
     """Measure how well a policy tracks velocities, in many walks in parallel."""
     chosen = load_robot(robot)
+    named: dict[str, Any] = {} if estimator_file is None else {"estimator_file": estimator_file}
     setup = Setup(
         robot=robot,
         policy=policy or shipped_policy(chosen),
         estimator=estimator,
-        estimator_file=estimator_file or shipped_estimator(chosen),
         terrain=terrain,
         randomised=randomised,
         actuator=actuator,
+        **named,
     )
-    PolicyFile(chosen, setup.policy)  # fail on a bad file here, once, before any run
-    LearnedEstimator(chosen, setup.estimator_file)
+    load_policy(chosen, setup.policy)  # fail on a bad file here, once, before any run
+    if setup.estimator_file is not None:
+        LearnedEstimator(chosen, setup.estimator_file)
     if actuator is not None:
         ActuatorParameters.load(chosen, actuator)
     folder = output_folder(out)

@@ -22,7 +22,7 @@ from quadvel_description.robot import Robot, load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import shipped_estimator
-from quadvel_policy.policy_file import PolicyFile, shipped_policy
+from quadvel_policy.policy_file import load_policy, shipped_policy
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.terrain import Terrain
@@ -43,7 +43,8 @@ class Setup:
         robot: Name of a shipped robot, or path of a robot.yaml.
         policy: ONNX file of the policy; the default is the shipped one of the robot.
         estimator: Velocity estimator in the loop, one of `robot_loop.ESTIMATORS`.
-        estimator_file: ONNX file of the learned estimator; the default is the shipped one of the robot.
+        estimator_file: ONNX file of the learned estimator; the default is the shipped one of the
+            robot, or None if there is none and the loop does not need it.
         terrain: One of TERRAINS.
         randomised: Whether the seed draws plant and actuators.
         actuator: File of an actuator model; None for the robot's.
@@ -55,8 +56,8 @@ class Setup:
         default=attrs.Factory(lambda setup: shipped_policy(load_robot(setup.robot)), takes_self=True)
     )
     estimator: str = "learned"
-    estimator_file: Path = attrs.field(
-        default=attrs.Factory(lambda setup: shipped_estimator(load_robot(setup.robot)), takes_self=True)
+    estimator_file: Path | None = attrs.field(
+        default=attrs.Factory(lambda setup: _shipped_estimator(setup), takes_self=True)
     )
     terrain: str = field("flat", one_of=TERRAINS)
     randomised: bool = False
@@ -71,6 +72,16 @@ class Setup:
         """
         fields = attrs.asdict(self, filter=lambda field, _: field.name != "plant")
         return {name: str(value) if isinstance(value, Path) else value for name, value in fields.items()}
+
+
+def _shipped_estimator(setup: Setup) -> Path | None:
+    """Return the shipped estimator; None if there is none, unless the loop needs it."""
+    try:
+        return shipped_estimator(load_robot(setup.robot))
+    except FileNotFoundError:
+        if setup.estimator == "learned":
+            raise
+        return None
 
 
 def make_simulator(setup: Setup, seed: int) -> Simulator:
@@ -118,7 +129,8 @@ def make_loop(setup: Setup, seed: int, shadow_estimators: Sequence[str] = ("lear
     Args:
         setup: Robot, policy, estimator and ground.
         seed: Seed of the run.
-        shadow_estimators: Kinds of further estimators to measure, see `RobotLoop`.
+        shadow_estimators: Kinds of further estimators to measure, see `RobotLoop`; "learned" only if
+            the setup has its file.
 
     Returns:
         A loop whose supervisor is in mode walk.
@@ -127,10 +139,12 @@ def make_loop(setup: Setup, seed: int, shadow_estimators: Sequence[str] = ("lear
     robot = simulator.config.robot
     loop = RobotLoop(
         simulator,
-        Supervisor(robot, PolicyFile(robot, setup.policy), backup=KalmanEstimator(robot)),
+        Supervisor(robot, load_policy(robot, setup.policy), backup=KalmanEstimator(robot)),
         make_estimator(setup.estimator, simulator, setup.estimator_file),
         shadow_estimators={
-            name: make_estimator(name, simulator, setup.estimator_file) for name in shadow_estimators
+            name: make_estimator(name, simulator, setup.estimator_file)
+            for name in shadow_estimators
+            if name != "learned" or setup.estimator_file is not None
         },
     )
     loop.start_walking()

@@ -36,7 +36,7 @@ from quadvel_nodes.scheduling import Scheduling
 from .control_loop import WATCH_PERIOD_S, ControlConfig, ControlLoop
 from .loop_stats import LoopSummary
 from .operator_log import OperatorLog
-from .policy_file import SHIPPED_POLICY, PolicyFile
+from .policy_file import SHIPPED_POLICY, load_policy
 from .received import planar_velocity
 from .supervisor import Supervisor
 from .tick_input import MotorStatus as Motors
@@ -68,7 +68,7 @@ class Controller(Node):
         self._settings = read_parameters(self, ControllerParameters)
         robot = load_robot(self._settings.robot)
         self._robot_check = RobotCheck(self, robot)
-        policy = PolicyFile(robot, self._settings.policy or None)
+        policy = load_policy(robot, self._settings.policy or None)
         policy.prepare()  # the first run is slow
         self._supervisor = Supervisor(
             robot, policy, self._settings.control.supervisor, KalmanEstimator(robot)

@@ -19,7 +19,8 @@ from quadvel_description.kinematics import foot_positions, inverse_kinematics, r
 from quadvel_description.robot import Robot
 from quadvel_description.state import JointCommand, RobotState
 
-from .observation import JOINTS, PolicyMetadata, build_observation
+from .imported.metadata import ImportedMetadata
+from .observation import JOINTS, PolicyMetadata
 
 LEAN_FILTER_S = 1.0
 """Time constant of the lean; a shorter one amplifies the sway of a standing robot (decision 50)."""
@@ -28,13 +29,11 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 class Policy(Protocol):
-    """Interface of a policy; `PolicyFile` implements it.
+    """Interface of a policy; `PolicyFile` and `ImportedPolicy` implement it."""
 
-    Attributes:
-        metadata: Gains, layout of the observation, and action map.
-    """
-
-    metadata: PolicyMetadata
+    @property
+    def metadata(self) -> PolicyMetadata | ImportedMetadata:
+        """Gains, rate, observer of the network's input, and action map."""
 
     def reset(self) -> None:
         """Reset the recurrent state."""
@@ -46,7 +45,7 @@ class Policy(Protocol):
         """Run one step.
 
         Args:
-            observation: The network input, (n,), as `build_observation` makes it.
+            observation: The network input, (n,), as the observer of the metadata makes it.
 
         Returns:
             The raw action, (12,).
@@ -274,6 +273,9 @@ class Posture:
 class Walk:
     """Runs the policy; its torques fade in over `blend_time` after the entry.
 
+    A policy with a lower rate than the control loop runs at some ticks; its targets are held at the
+    others.
+
     Attributes:
         inference_seconds: Duration of the last network step, s; NaN before the first.
     """
@@ -288,16 +290,19 @@ class Walk:
         self._policy = policy
         self._blend_time = blend_time
         meta = policy.metadata
-        self._observation, self._action = meta.observation, meta.action
+        self._observer, self._action = meta.observer, meta.action
+        self._ticks_per_step = meta.ticks_per_step
         self._kp, self._kd = np.array(meta.kp), np.array(meta.kd)
         self._fade_from = JointCommand.damping()
         self.inference_seconds = float("nan")
         self.reset()
 
     def reset(self) -> None:
-        """Reset the recurrent state and the previous action of the policy."""
+        """Reset the recurrent state, the past observations and the previous action of the policy."""
         self._policy.reset()
+        self._observer.reset()
         self._previous_action = np.zeros(JOINTS, np.float32)
+        self._held_ticks = self._ticks_per_step  # the next tick runs the network
 
     def prepare(self) -> None:
         """Compute the part of the next step that needs no observation."""
@@ -313,7 +318,7 @@ class Walk:
         self._fade_from = inputs.previous
 
     def tick(self, inputs: ModeInput) -> JointCommand:
-        """Run one step of the policy.
+        """Run one step of the policy, if one is due.
 
         Args:
             inputs: The input, with a velocity.
@@ -325,19 +330,15 @@ class Walk:
             FloatingPointError: The output of the policy is not finite.
         """
         assert inputs.velocity is not None  # the supervisor does not walk without one
-        observation = build_observation(
-            self._observation,
-            command=inputs.command,
-            quaternion=inputs.state.quaternion,
-            q=inputs.state.q,
-            dq=inputs.state.dq,
-            linear_velocity=inputs.velocity,
-            angular_velocity=inputs.state.angular_velocity,
-            previous_action=self._previous_action,
-        )
-        start = time.perf_counter()
-        self._previous_action = self._policy.step(observation)
-        self.inference_seconds = time.perf_counter() - start
+        if self._held_ticks == self._ticks_per_step:
+            observation = self._observer.observe(
+                inputs.state, inputs.velocity, inputs.command, self._previous_action
+            )
+            start = time.perf_counter()
+            self._previous_action = self._policy.step(observation)
+            self.inference_seconds = time.perf_counter() - start
+            self._held_ticks = 0
+        self._held_ticks += 1
         requested = JointCommand(q=self._action.targets(self._previous_action), kp=self._kp, kd=self._kd)
         if inputs.elapsed < self._blend_time:
             return blend(self._fade_from, requested, inputs.elapsed / self._blend_time)

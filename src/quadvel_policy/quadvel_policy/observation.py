@@ -24,6 +24,7 @@ from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.recurrent_network import SCHEMA
 from quadvel_description.robot import Robot
 from quadvel_description.robot_name import UNNAMED_ROBOT
+from quadvel_description.state import RobotState
 
 RATE_HZ = 200.0
 JOINTS = len(JOINT_NAMES)
@@ -121,6 +122,46 @@ def build_observation(
         return observation
     out[...] = observation
     return out
+
+
+class Observer:
+    """Builds the input of a policy's network from what is measured."""
+
+    def __init__(self, spec: ObservationSpec) -> None:
+        """Create an observer.
+
+        Args:
+            spec: Terms of the observation.
+        """
+        self._spec = spec
+
+    def reset(self) -> None:
+        """Forget past observations."""
+
+    def observe(
+        self, state: RobotState, velocity: ArrayLike, command: ArrayLike, previous_action: ArrayLike
+    ) -> NDArray[np.float32]:
+        """Build the observation of one step.
+
+        Args:
+            state: The measured state.
+            velocity: Velocity of the trunk, body frame, (3,), m/s.
+            command: vx, vy (m/s), wz (rad/s), stance (0 or 1), (4,).
+            previous_action: Output of the network at its previous step, (12,).
+
+        Returns:
+            The network input, (n,).
+        """
+        return build_observation(
+            self._spec,
+            command=command,
+            quaternion=state.quaternion,
+            q=state.q,
+            dq=state.dq,
+            linear_velocity=velocity,
+            angular_velocity=state.angular_velocity,
+            previous_action=previous_action,
+        )
 
 
 class MetadataError(ValueError):
@@ -235,7 +276,7 @@ def _text(field: str, value: Any) -> str:
 
 MAX_GAINS = {"kp": 500.0, "kd": 20.0}  # N m/rad, N m s/rad; larger than usual gains of such robots
 
-_CHECKS: dict[str, Callable[[str, Any], Any]] = {
+FIELD_CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "schema": _schema,
     "robot": _text,
     "joint_names": _joint_names,
@@ -252,6 +293,7 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "state_shape": _state_shape,
     "commit": _text,
 }
+"""Check of each field of the metadata: field and value to the value in its final form."""
 
 
 @attrs.frozen(kw_only=True, eq=False)
@@ -304,8 +346,18 @@ class PolicyMetadata:
     commit: str = ""
 
     def __attrs_post_init__(self) -> None:
-        for field, check in _CHECKS.items():
+        for field, check in FIELD_CHECKS.items():
             object.__setattr__(self, field, check(field, getattr(self, field)))
+
+    @property
+    def ticks_per_step(self) -> int:
+        """Ticks of the control loop for which an action is held."""
+        return max(round(RATE_HZ / self.rate_hz), 1)
+
+    @property
+    def observer(self) -> Observer:
+        """A new observer of the network's input."""
+        return Observer(self.observation)
 
     @property
     def action(self) -> ActionMap:

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.network_file import NetworkFileError
+from quadvel_description.network_file import NetworkFileError, read_network
 from quadvel_description.recurrent_network import RecurrentNetwork
 from quadvel_description.robot import Robot
 from quadvel_description.robot_name import shipped_file
 
+from .imported.policy import ImportedPolicy, metadata_text
 from .observation import JOINTS, RATE_HZ, REQUIRED_FIELDS, MetadataError, PolicyMetadata
 
 _POLICIES = Path(__file__).parent / "policies"
@@ -34,6 +35,26 @@ def shipped_policy(robot: Robot) -> Path:
         FileNotFoundError: None is shipped for this robot.
     """
     return shipped_file(_POLICIES, robot.name, SHIPPED_POLICY.name)
+
+
+def load_policy(robot: Robot, path: str | Path | None = None) -> PolicyFile | ImportedPolicy:
+    """Load a policy that runs on a robot: one of our own, or an imported one.
+
+    Args:
+        robot: The robot that the policy has to belong to.
+        path: The ONNX file; None for the shipped one.
+
+    Returns:
+        The policy.
+
+    Raises:
+        NetworkFileError: The file is missing or is not a policy for this robot; one sentence with
+            the name of the file.
+    """
+    path = shipped_policy(robot) if path is None else Path(path)
+    if metadata_text(read_network(path)) is None:
+        return PolicyFile(robot, path)
+    return ImportedPolicy(robot, path)
 
 
 class PolicyFile:

@@ -1,0 +1,1 @@
+"""Policies that other projects trained: their formats, their observations, and how they run here."""
