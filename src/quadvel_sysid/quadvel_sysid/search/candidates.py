@@ -114,7 +114,7 @@ class Candidates:
     def _gain_on_needed_joints(self, fitted: FittedModel) -> float:
         """Reduction of the criterion by a candidate on the joints alone that it improves."""
         cost = PENALTY_PER_PARAMETER * fitted.last_effect.candidate.complexity(self._options.memory_cost)
-        gain = np.log(self._before.selection_mse) - np.log(fitted.selection_mse) - cost
+        gain = self._before.log_errors - fitted.log_errors - cost
         return float(np.sum(np.maximum(gain, 0.0)))
 
     def _refit_near_delays(self, fitted: FittedModel) -> FittedModel:

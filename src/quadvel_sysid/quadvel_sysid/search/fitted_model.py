@@ -69,9 +69,16 @@ class FittedModel:
         The logarithm is twice the negative log-likelihood of a row for normal noise of unknown
         variance. Lower is better.
         """
-        return float(
-            np.log((self.selection_mse + _VARIANCE_FLOOR) / (self.evaluator.noise + _VARIANCE_FLOOR)).sum()
-        ) + PENALTY_PER_PARAMETER * parameter_count(self.model, self.evaluator.options.memory_cost)
+        return float(self.log_errors.sum()) + PENALTY_PER_PARAMETER * parameter_count(
+            self.model, self.evaluator.options.memory_cost
+        )
+
+    @property
+    def log_errors(self) -> Array:
+        """Logarithm of each joint's error on the selection rows, relative to the noise, (J,)."""
+        noise = self.evaluator.noise + _VARIANCE_FLOOR
+        found: Array = np.log((self.selection_mse + _VARIANCE_FLOOR) / noise)
+        return found
 
     def compare_with(self, before: FittedModel) -> Comparison:
         """Compare with another fitted model on the selection rows.
