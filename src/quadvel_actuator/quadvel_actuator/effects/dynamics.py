@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from quadvel_description.arrays import Array
 
+from . import recurrence
 from .base import (
     AddedEffect,
     ErrorEffect,
@@ -56,9 +57,17 @@ def _previous_row(x: Array, s: Any) -> Array:
     return np.where(s.start, x, np.concatenate([x[..., :1, :], x[..., :-1, :]], axis=-2))
 
 
-def _once_if_shared(time: Array) -> Array:
-    """A time constant (..., J) of one joint (..., 1) if all joints share it, as exponentials take long."""
-    return time[..., :1] if np.ndim(time) and (time == time[..., :1]).all() else time
+def _decay(dt: Array, time: Array) -> Array:
+    """Compute exp(-dt / T) - 1, (..., N, J) or (..., N, 1), once for equal time constants.
+
+    Exponentials take long. Often all joints, or most members of a batch, share a time constant.
+    """
+    if np.ndim(time) and (time == time[..., :1]).all():
+        time = time[..., :1]
+    if np.ndim(time) < 3:
+        return np.expm1(-dt / time)
+    distinct, which = np.unique(time, axis=0, return_inverse=True)
+    return np.expm1(-dt / distinct)[which.ravel()]
 
 
 def lag_series(x: Array, s: Any, time: Array) -> Array:
@@ -72,19 +81,8 @@ def lag_series(x: Array, s: Any, time: Array) -> Array:
     Returns:
         Filtered rows, (..., N, J).
     """
-    # y[k] - d[k] y[k-1] = (1 - d[k]) x[k], with d[k] = exp(-dt[k] / T), and d = 0 where a stretch
-    # starts. This is a lower bidiagonal system; all joints and guesses are solved as one.
-    from scipy.linalg.blas import dtbsv  # nodes, which do not filter rows, start without SciPy
-
-    time = _once_if_shared(time)
-    gone = np.where(s.start, -1.0, np.expm1(-s.dt / time))  # d - 1
-    gone[..., 0, :] = -1.0
-    gone, x = (one.swapaxes(-1, -2) for one in np.broadcast_arrays(gone, x))  # (..., J, N)
-    band = np.ones((2, gone.size), order="F")
-    band[1, :-1] = -1.0 - gone.reshape(-1)[1:]
-    given = (-gone * x).reshape(-1)
-    out: Array = dtbsv(1, band, given, lower=1, diag=1, overwrite_x=1).reshape(gone.shape)
-    return out.swapaxes(-1, -2)
+    filtered: Array = recurrence.lag_series(x, s.start, _decay(s.dt, time))
+    return filtered
 
 
 class FirstOrderLag(MemoryEffect):
@@ -110,9 +108,9 @@ class FirstOrderLag(MemoryEffect):
         # before.
         # Both parts together equal a constant input before + w (x - before), with
         #     w = (1 - exp(-age / T)) / (1 - exp(-dt / T))
-        before, time = _previous_row(x, s), _once_if_shared(p["T"])
-        late = -np.expm1(-np.minimum(s.age, s.dt) / time) / -np.expm1(-s.dt / time)
-        return lag_series(before + late * (x - before), s, time)
+        before, gone = _previous_row(x, s), _decay(s.dt, p["T"])
+        late = _decay(np.minimum(s.age, s.dt), p["T"]) / gone
+        return recurrence.lag_series(before + late * (x - before), s.start, gone)
 
 
 class VelocityFilter(MemoryEffect):

@@ -1,4 +1,4 @@
-"""Nonlinear recurrences: backlash, Bouc-Wen hysteresis and rate limit.
+"""Recurrences along the rows of a series: lag, backlash, Bouc-Wen hysteresis and rate limit.
 
 Each step is written once, for numbers and arrays. A running model takes one step at a time. Series
 of rows run as compiled loops: one Python step per row would take most of the time of an
@@ -85,6 +85,22 @@ def _chase_target(given: Any, target: Any, slope: Any, time: Any, rate: Any) -> 
     return given - side * rate * chased + np.minimum(np.maximum(slope, -rate), rate) * (time - chased)
 
 
+def lag_series(x: Any, start: Any, gone: Any) -> Any:
+    """Apply a first-order lag along the rows of a series.
+
+        y = y_before - gone (x - y_before)
+
+    Args:
+        x: input, constant over each step, (..., N, J).
+        start: where a stretch starts at rest, broadcast to (..., N, J).
+        gone: exp(-dt / T) - 1 of each step, broadcast to (..., N, J).
+
+    Returns:
+        Output, (..., N, J).
+    """
+    return _run_loop(_compiled_loops()["lag_loop"], (x, start, gone), ())
+
+
 def backlash_series(seen: Any, start: Any, gap: Any) -> Any:
     """Apply `backlash_step` along the rows of a series.
 
@@ -154,6 +170,14 @@ def _compiled_loops() -> dict[str, Callable[..., Any]]:
     for step in (backlash_step, bouc_wen_step, _chase_target, rate_limit_step):
         register_jitable(step)
 
+    def lag_loop(x: Any, start: Any, gone: Any, out: Any) -> None:
+        for b in range(x.shape[0]):
+            out[b, 0] = x[b, 0]
+            for n in range(1, x.shape[1]):
+                for j in range(x.shape[2]):
+                    before = x[b, n, j] if start[b, n, j] else out[b, n - 1, j]
+                    out[b, n, j] = before - gone[b, n, j] * (x[b, n, j] - before)
+
     def backlash_loop(seen: Any, start: Any, gap: Any, out: Any) -> None:
         for b, j in np.ndindex(gap.shape):
             follows = seen[b, 0, j]
@@ -192,6 +216,7 @@ def _compiled_loops() -> dict[str, Callable[..., Any]]:
     rows, on = (numba.types.Array(kind, 3, "A", readonly=True) for kind in (numba.float64, numba.boolean))
     number, out = numba.types.Array(numba.float64, 2, "A", readonly=True), numba.float64[:, :, ::1]
     kinds = {
+        lag_loop: (rows, on, rows, out),
         backlash_loop: (rows, on, number, out),
         bouc_wen_loop: (rows, on, number, number, out),
         rate_limit_loop: (rows, rows, rows, on, number, out),

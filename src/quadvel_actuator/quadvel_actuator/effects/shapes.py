@@ -215,12 +215,17 @@ class Filter(Shape):
         n = np.arange(len(u))
         began = np.maximum.accumulate(np.where(start, n, 0))
         sums = np.concatenate([np.zeros((1, u.shape[1])), np.cumsum(u, axis=0)])
-        columns = [u]
-        for near, far in self._windows(dt):
+        rested = u.take(began, axis=0)
+        columns = np.empty((self.count, *u.shape))
+        columns[0] = u
+        for column, (near, far) in zip(columns[1:], self._windows(dt), strict=True):
             a, b = np.maximum(n - far + 1, began), np.maximum(n - near + 1, began)
             before = (far - near - (b - a))[:, None]  # rows before the stretch began, where it rested
-            columns.append((sums[b] - sums[a] + before * u[began]) / (far - near) - u)
-        return np.stack(columns, axis=1)
+            np.subtract(sums.take(b, axis=0), sums.take(a, axis=0), out=column)
+            column += before * rested
+            column /= far - near
+            column -= u
+        return np.moveaxis(columns, 0, 1)
 
     @override
     def rest(self, u: Array, dt: float) -> Memory:

@@ -7,7 +7,7 @@ its own small Jacobian block, so that the normal equations stay small for any nu
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import product
 
 import attrs
@@ -203,33 +203,76 @@ def normal_equations(model: Model, unknowns: Unknowns, rows: Bools) -> tuple[Arr
     Returns:
         J'J (K, K), J'r (K,), derivatives (J, A, N) and residual (N, J), both 0 outside `rows`.
     """
-    predicted, slopes = jacobian(model, unknowns)
-    residual = np.where(rows, model.samples.tau - predicted, 0.0)
-    slopes *= rows.T[:, None]
-    hessian = unknowns.accumulate(slopes @ slopes.transpose(0, 2, 1))
-    gradient = unknowns.accumulate(np.einsum("jan,nj->ja", slopes, residual))
+    slopes, residual = _linearised(model, unknowns, rows)
+    hessian, gradient = (unknowns.accumulate(one) for one in _joint_products(slopes, residual))
     return hessian, gradient, slopes, residual
 
 
+def expected_errors(models: Sequence[Model], rows: Bools) -> list[Array]:
+    """Predict the errors of models whose joints share gains and delays in other groups.
+
+    Args:
+        models: Models with equal values, which differ in their groups alone.
+        rows: Samples to fit, (N, J) bool.
+
+    Returns:
+        For each model the squared error of each joint (J,), N^2 m^2, that its linearisation expects
+        of a fit.
+    """
+    # One linearisation serves all groups: joint j has the error r'r - 2 g'd + d'H d after a step d.
+    model, rows = _fitted_rows_only(models[0], rows)
+    slopes, residual = _linearised(model, Unknowns.of(model), rows)
+    hessians, gradients = _joint_products(slopes, residual)
+    found = []
+    for one in models:
+        unknowns = Unknowns.of(one)
+        hessian, gradient, x = _penalised(one, unknowns, hessians, gradients)
+        change = _bounded_minimum(hessian, gradient, unknowns.low - x, unknowns.high - x)
+        step = np.where(unknowns.index >= 0, change[unknowns.index], 0.0)  # (A, J)
+        reduction = 2.0 * np.einsum("ja,aj->j", gradients, step)
+        reduction -= np.einsum("aj,jab,bj->j", step, hessians, step)
+        found.append(np.sum(residual**2, axis=0) - reduction)
+    return found
+
+
+def _linearised(model: Model, unknowns: Unknowns, rows: Bools) -> tuple[Array, Array]:
+    """Derivatives (J, A, N) and residual (N, J), both 0 outside `rows`."""
+    predicted, slopes = jacobian(model, unknowns)
+    slopes *= rows.T[:, None]
+    return slopes, np.where(rows, model.samples.tau - predicted, 0.0)
+
+
+def _joint_products(slopes: Array, residual: Array) -> tuple[Array, Array]:
+    """Products J'J (J, A, A) and J'r (J, A) of each joint."""
+    return slopes @ slopes.transpose(0, 2, 1), (slopes @ residual.T[:, :, None])[..., 0]
+
+
+def _penalised(
+    model: Model, unknowns: Unknowns, hessians: Array, gradients: Array
+) -> tuple[Array, Array, Array]:
+    """Normal equations H = J'J + P and g = J'r - P x with the penalty P, and the unknowns x."""
+    hessian, gradient = unknowns.accumulate(hessians), unknowns.accumulate(gradients)
+    penalty, x = _weight_penalty(model, unknowns, hessian), unknowns.vector(pack(model))
+    return hessian + penalty, gradient - penalty @ x, x
+
+
 def _damped_step(model: Model, unknowns: Unknowns, rows: Bools, error: float) -> tuple[Model, float] | None:
-    """The model after a step that reduces the error, and that error; None if no damping does."""
+    """The model after a step that reduces the error, and that error; None if converged."""
     # Levenberg-Marquardt step d of the penalised problem, with H = J'J + P and g = J'r - P x:
     #     minimise  d'(H + lambda D) d / 2 - g'd   subject to   low <= x + d <= high
-    # where D is the diagonal of H. The first lambda that reduces the true squared error counts.
-    hessian, gradient, _, _ = normal_equations(model, unknowns, rows)
-    theta = pack(model)
-    x = unknowns.vector(theta)
-    penalty = _weight_penalty(model, unknowns, hessian)
-    hessian, gradient = hessian + penalty, gradient - penalty @ x - _averaging_gradient(model, unknowns, rows)
-    diagonal = np.diagonal(hessian) + 1e-12 * (1.0 + np.diagonal(hessian).max(initial=0.0))
+    # where D is the diagonal of H. The first lambda that reduces the true squared error counts. The
+    # linear problem expects a reduction of 2 g'd - d'H d, less for every larger lambda. If that is
+    # below the limit of convergence, the model is not evaluated.
+    products = _joint_products(*_linearised(model, unknowns, rows))
+    hessian, gradient, x = _penalised(model, unknowns, *products)
+    gradient, theta = gradient - _averaging_gradient(model, unknowns, rows), pack(model)
+    diagonal = _curvature(hessian)
     for damping in _DAMPING_FACTORS:
         change = _bounded_minimum(
-            hessian + np.diag(damping * diagonal),
-            gradient,
-            unknowns.low - x,
-            unknowns.high - x,
-            np.sqrt(diagonal),
+            hessian + np.diag(damping * diagonal), gradient, unknowns.low - x, unknowns.high - x
         )
+        if 2.0 * gradient @ change - change @ hessian @ change < _CONVERGED * error:
+            return None
         after = np.where(unknowns.index >= 0, (x + change)[unknowns.index], theta)
         moved = with_slots(model, after)
         moved_error = squared_error(moved, rows)
@@ -266,12 +309,20 @@ def _weight_penalty(model: Model, unknowns: Unknowns, hessian: Array) -> Array:
     return total
 
 
-def _bounded_minimum(matrix: Array, gradient: Array, low: Array, high: Array, scale: Array) -> Array:
+def _curvature(hessian: Array) -> Array:
+    """Diagonal (K,) of a matrix, slightly raised where it is 0."""
+    diagonal = np.diagonal(hessian)
+    found: Array = diagonal + 1e-12 * (1.0 + diagonal.max(initial=0.0))
+    return found
+
+
+def _bounded_minimum(matrix: Array, gradient: Array, low: Array, high: Array) -> Array:
     """Minimum of x'Ax/2 - g'x within bounds that contain 0, by block pivoting.
 
     A variable beyond a bound is fixed there. It becomes free again when the gradient at the bound
     points back inside (the Karush-Kuhn-Tucker conditions).
     """
+    scale = np.sqrt(_curvature(matrix))
     matrix, gradient = matrix / np.outer(scale, scale), gradient / scale
     matrix = matrix + 1e-12 * np.eye(len(matrix))
     low, high = np.minimum(low, 0.0) * scale, np.maximum(high, 0.0) * scale

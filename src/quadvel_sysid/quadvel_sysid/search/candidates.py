@@ -15,10 +15,11 @@ from ..model.effect_candidate import EffectCandidate
 from ..model.fit import fit, fit_near_delays
 from ..model.torque_model import Model
 from ..parallel import parallel_map
+from ..statistics.criterion import PENALTY_PER_PARAMETER
 from . import regressor_library
 from .context import Context
 from .effect_candidates.registry import effect_candidates
-from .fitted_model import TRIAL_ITERATIONS, FittedModel
+from .fitted_model import RIVAL_FRACTION, TRIAL_ITERATIONS, FittedModel
 from .regressors import RegressorCandidate
 from .screening import CandidateScreening, ScreenedCandidate, promising
 
@@ -101,13 +102,20 @@ class Candidates:
         return Fitted(self._fit_screened(best), len({one.key for one in every}))
 
     def _fit_screened(self, chosen: Sequence[ScreenedCandidate]) -> list[FittedModel]:
-        """Fit the candidates: a few steps of each, then whole fits of the best ones."""
+        """Fit the candidates: a few steps of each, then whole fits of the best one and its rivals."""
         begun = self._fit_parallel(lambda k: self._begin_fit(chosen[k]), len(chosen))
         begun.sort(key=lambda one: one.criterion)
-        count = self._options.finished_fits
-        return (
-            self._fit_parallel(lambda k: self._finish_fit(begun[k]), min(count, len(begun))) + begun[count:]
-        )
+        gains = [self._gain_on_needed_joints(one) for one in begun]
+        rivals = [k for k, gain in enumerate(gains) if not k or gain > RIVAL_FRACTION * gains[0]]
+        rivals = rivals[: self._options.finished_fits]
+        finished = self._fit_parallel(lambda k: self._finish_fit(begun[rivals[k]]), len(rivals))
+        return finished + [one for k, one in enumerate(begun) if k not in rivals]
+
+    def _gain_on_needed_joints(self, fitted: FittedModel) -> float:
+        """Reduction of the criterion by a candidate on the joints alone that it improves."""
+        cost = PENALTY_PER_PARAMETER * fitted.last_effect.candidate.complexity(self._options.memory_cost)
+        gain = self._before.log_errors - fitted.log_errors - cost
+        return float(np.sum(np.maximum(gain, 0.0)))
 
     def _refit_near_delays(self, fitted: FittedModel) -> FittedModel:
         """Refit a regressor from nearby delays if that is better; its screening used one pair."""
@@ -129,15 +137,19 @@ class Candidates:
         evaluator, model, candidate = self._evaluator, screened.model, screened.candidate
         if not self._options.second_starts:
             return evaluator.fit(model, TRIAL_ITERATIONS).model
-        near = model.with_delays(self._before.model.delays)
+        starts = [model]
+        if candidate.confounded_with_delays:
+            starts.append(model.with_delays(self._before.model.delays))
         if candidate.confounded_with_gain:
             # A value that all joints share is a change of a gain or a delay. One joint without the
             # effect makes the fit unique.
             rows = evaluator.parts.fit
-            model, near = (_drop_weakest_joint(fit(start, rows, 4, delays=False)) for start in (model, near))
-        starts = [model, near] if candidate.confounded_with_delays else [model]
-        begun = (evaluator.fit(start, TRIAL_ITERATIONS) for start in starts)
-        return min(begun, key=lambda one: one.criterion).model
+            starts = [_drop_weakest_joint(fit(start, rows, 4, delays=False)) for start in starts]
+        if len(starts) == 1:
+            return evaluator.fit(starts[0], TRIAL_ITERATIONS).model
+        begun = (evaluator.fit(start, TRIAL_ITERATIONS // 2) for start in starts)
+        better = min(begun, key=lambda one: one.criterion)
+        return evaluator.fit(better.model, TRIAL_ITERATIONS - TRIAL_ITERATIONS // 2).model
 
     def _finish_fit(self, begun: FittedModel) -> Model:
         """The whole fit of a candidate: on the joints that need it, with values that joints share."""

@@ -12,7 +12,7 @@ from quadvel_description.arrays import Array, Indices
 
 from ..data.split import DataSplit
 from ..model.applied_effect import AppliedEffect
-from ..model.fit import MAX_ITERATIONS, fit, fit_delay_profile, fit_delay_splits
+from ..model.fit import MAX_ITERATIONS, expected_errors, fit, fit_delay_profile, fit_delay_splits
 from ..model.torque_model import Model
 from ..options import SEARCH_DEFAULTS, SearchOptions
 from ..parallel import parallel_map
@@ -28,6 +28,8 @@ from ..statistics.criterion import (
 
 TRIAL_ITERATIONS = 4
 """Steps of a fit that show which of several models or starts is worth a whole fit."""
+RIVAL_FRACTION = 0.5
+"""Fraction of the best candidate's gain above which another candidate is its rival."""
 _VARIANCE_FLOOR = 1e-12
 """Added to variances, N^2 m^2, for logs without noise."""
 
@@ -67,9 +69,16 @@ class FittedModel:
         The logarithm is twice the negative log-likelihood of a row for normal noise of unknown
         variance. Lower is better.
         """
-        return float(
-            np.log((self.selection_mse + _VARIANCE_FLOOR) / (self.evaluator.noise + _VARIANCE_FLOOR)).sum()
-        ) + PENALTY_PER_PARAMETER * parameter_count(self.model, self.evaluator.options.memory_cost)
+        return float(self.log_errors.sum()) + PENALTY_PER_PARAMETER * parameter_count(
+            self.model, self.evaluator.options.memory_cost
+        )
+
+    @property
+    def log_errors(self) -> Array:
+        """Logarithm of each joint's error on the selection rows, relative to the noise, (J,)."""
+        noise = self.evaluator.noise + _VARIANCE_FLOOR
+        found: Array = np.log((self.selection_mse + _VARIANCE_FLOOR) / noise)
+        return found
 
     def compare_with(self, before: FittedModel) -> Comparison:
         """Compare with another fitted model on the selection rows.
@@ -159,6 +168,38 @@ class ModelEvaluator:
             lambda k: fit(models[k], self.parts.fit, iterations), len(models), self.cores, models[0].samples
         )
         return [FittedModel(one, self) for one in found]
+
+    def finer_groupings(self, fitted: FittedModel, limit: float) -> list[FittedModel]:
+        """Fit models with gains, or delays, for each kind of joint and for each joint.
+
+        Args:
+            fitted: A fitted model.
+            limit: Criterion that a model has to reach.
+
+        Returns:
+            The models that reach it.
+        """
+        model, finer = fitted.model, list[Model]()
+        for groups in joint_groupings(model.samples.joints) if self.options.gains_of_each_joint else ():
+            count = len(np.unique(groups))
+            if count > len(np.unique(model.gain_groups)):
+                finer.append(attrs.evolve(model, gain_groups=groups))
+            if count > len(np.unique(model.delay_groups)):
+                finer.append(attrs.evolve(model, delay_groups=groups))
+        # Most finer groupings gain less than their parameters cost, which one linearisation or few
+        # steps show.
+        errors = expected_errors([model, *finer], self.parts.fit)
+        change = [
+            float(np.log(error + _VARIANCE_FLOOR).sum() - np.log(errors[0] + _VARIANCE_FLOOR).sum())
+            + PENALTY_PER_PARAMETER * (self._parameter_count(one) - self._parameter_count(model))
+            for one, error in zip(finer, errors[1:], strict=True)
+        ]
+        expected = [one for one, each in zip(finer, change, strict=True) if fitted.criterion + each < limit]
+        begun = self.fit_each(expected, iterations=TRIAL_ITERATIONS)
+        return self.fit_each([one.model for one in begun if one.criterion < limit])
+
+    def _parameter_count(self, model: Model) -> float:
+        return parameter_count(model, self.options.memory_cost)
 
     def refine_delays(self, fitted: FittedModel) -> FittedModel:
         """Search the delays again on a grid, as biased delays may have hidden the optimum.

@@ -45,6 +45,8 @@ _BATCH_SIZE = 8
 """Batch size of starting values."""
 _MIN_ERROR_RATIO = 1e-3
 """Lower bound of the remaining error in the score, relative to the error before."""
+_ROUNDING = 1e-14
+"""Rounding error of products of columns, relative to their diagonal."""
 _AMPLITUDE_RANGE = (0.7, 1.4)
 """Range of the amplitude of a nonlinear effect, relative to its starting values."""
 
@@ -348,7 +350,7 @@ class DelayGridPoint:
             Regressors, (S, J, L, n).
         """
         joints = self.residual.shape[0]
-        found = []
+        found: list[Array] = []
         model, every, groups = self.model, np.ones(joints, dtype=bool), np.arange(joints)
         if candidate.linear:
             # Regressors phi_l of tau = ... + sum_l w_l phi_l, at the starts of the other
@@ -373,7 +375,10 @@ class DelayGridPoint:
                     np.repeat(model.gains[None], len(values), axis=0), [*batch, values]
                 )
                 found += list((torque - base)[:, self._rows].transpose(0, 2, 1)[:, :, None])
-        return np.stack(found) * self._screening.weight.T[None, :, None]
+        weighted = np.empty((len(found), *found[0].shape))
+        for out, columns in zip(weighted, found, strict=True):
+            np.multiply(columns, self._screening.weight.T[:, None], out=out)
+        return weighted
 
     def best_start(self, candidate: EffectCandidate, table: Array) -> tuple[Model, Array]:
         """Find the best starting values of a candidate on each joint.
@@ -385,9 +390,7 @@ class DelayGridPoint:
         Returns:
             Model with the candidate at its best start, and the remaining weighted squared error (J,).
         """
-        regressors = self.regressors(candidate, table)
-        projected = np.stack([self.project_out(one) for one in regressors])
-        error, choice, (change, weights) = self._solve(projected, candidate)
+        error, choice, (change, weights) = self._solve(self.regressors(candidate, table), candidate)
         return self._model_at_start(candidate, table, choice, change, weights), error + self._averaged
 
     def _solve(
@@ -400,17 +403,24 @@ class DelayGridPoint:
         """
         # Linear model of joint j at start s: residual r = C'w + S'b + noise, with the regressors
         # C (L, n) and weights w of the candidate, and the derivatives S (4, n) and changes b of
-        # gains and delays. cc, cr, cs, ss and sr are the products C C', C r, C S', S S' and S r.
+        # gains and delays. cc, cr, cs, ss and sr are the products C C', C r, C S', S S' and S r. With
+        # the basis B of the model's effects, (I - B B') C' has the products C C' - C B (C B)', C r and
+        # C S', as r and S are orthogonal to B.
         joints, size = columns.shape[1:3]
         penalty = None if candidate is None else candidate.penalty
         cc = columns @ columns.swapaxes(-1, -2)
+        total = np.einsum("sjll->sj", cc)[..., None, None]
+        for j, basis in enumerate(self.basis):
+            within = columns[:, j] @ basis  # (S, L, k)
+            cc[:, j] -= within @ within.swapaxes(-1, -2)
+        cc = cc + _ROUNDING * total * np.eye(size)
         scale = np.einsum("sjll->sj", cc)[..., None, None] / max(size, 1)
         ridge = 1e-8 * np.eye(size) if penalty is None else RIDGE * penalty
         cc = cc + ridge * scale + 1e-12 * np.eye(size)
-        cr = np.einsum("sjln,jn->sjl", columns, self.residual)
-        cs = np.einsum("sjln,jkn->sjlk", columns, self.shared_slopes)
-        cc_cs = np.linalg.solve(cc, cs)
-        local = np.linalg.solve(cc, cr[..., None])[..., 0]
+        cr = (columns @ self.residual[:, :, None])[..., 0]
+        cs = columns @ self.shared_slopes.swapaxes(-1, -2)
+        solved = np.linalg.solve(cc, np.concatenate([cs, cr[..., None]], axis=-1))
+        cc_cs, local = solved[..., :-1], solved[..., -1]
         ss = self.shared_slopes @ self.shared_slopes.swapaxes(-1, -2)
         sr = np.einsum("jkn,jn->jk", self.shared_slopes, self.residual)
 
@@ -455,10 +465,9 @@ class DelayGridPoint:
         """Best change (4, J) of gains and delays, shared by joints as in the model."""
         # Sum of the joints' normal equations H b = g, in the unknowns that they share.
         total, right = np.zeros((self.count, self.count)), np.zeros(self.count)
-        for j in range(hessian.shape[0]):
-            at = self.index[:, j]
-            total[np.ix_(at, at)] += hessian[j]
-            right[at] += gradient[j]
+        at = self.index.T
+        np.add.at(total, (at[:, :, None], at[:, None, :]), hessian)
+        np.add.at(right, at, gradient)
         change = _ridge_solve(total, right)
         # Delays, the last unknowns, stay in the range of the linearisation; the gains follow them.
         is_delay = np.arange(self.count) >= self.index[2].min()

@@ -25,13 +25,11 @@ from ..statistics.criterion import (
     Comparison,
 )
 from .candidates import EFFECTS, REGRESSORS, Candidates
-from .fitted_model import TRIAL_ITERATIONS, FittedModel, ModelEvaluator, joint_groupings
+from .fitted_model import RIVAL_FRACTION, FittedModel, ModelEvaluator
 from .regressors import RegressorCandidate
 
 MAX_EFFECTS = 5
 """Maximum number of effects of one log."""
-RIVAL_FRACTION = 0.5
-"""Fraction of the best candidate's gain above which another candidate is its rival."""
 EQUIVALENCE_MARGIN = 0.02
 """Relative difference of a joint's error below which two effects are indistinguishable."""
 
@@ -257,11 +255,23 @@ class Search:
     def _add_best(self, before: FittedModel, kinds: str, record: SearchRecord) -> FittedModel | None:
         """The model with the best candidate added; None if no candidate passes the test."""
         fitted = self._candidates_of(before).fitted_candidates(kinds)
-        candidates = [*fitted.models, *self._finer_groupings(before)]
-        candidates.sort(key=lambda one: one.criterion)
+        best = min((one.criterion for one in fitted.models), default=before.criterion)
+        limit = before.criterion - RIVAL_FRACTION * max(before.criterion - best, 0.0)
+        rivals = self.evaluator.finer_groupings(before, limit)
+        candidates = sorted([*fitted.models, *rivals], key=lambda one: one.criterion)
         record.add_rivals(before, candidates)
+        accepted = self._first_accepted(before, candidates, fitted.tested_count, record)
+        if accepted is None and limit < before.criterion:
+            others = self.evaluator.finer_groupings(before, before.criterion)
+            accepted = self._first_accepted(before, others, fitted.tested_count, record)
+        return accepted
+
+    def _first_accepted(
+        self, before: FittedModel, candidates: Sequence[FittedModel], tested_count: int, record: SearchRecord
+    ) -> FittedModel | None:
+        """The first candidate that passes the test, if any; `record` receives the others."""
         for candidate in candidates:
-            reason = self._rejection_reason(before, candidate, fitted.tested_count)
+            reason = self._rejection_reason(before, candidate, tested_count)
             if not reason:
                 return candidate
             if len(candidate.model.effects) > len(before.model.effects):
@@ -298,20 +308,6 @@ class Search:
         if structure not in self._candidate_cache:
             self._candidate_cache[structure] = Candidates(before)
         return self._candidate_cache[structure]
-
-    def _finer_groupings(self, before: FittedModel) -> list[FittedModel]:
-        """Models with gains, or delays, for each kind of joint and for each joint."""
-        model, joints = before.model, before.model.samples.joints
-        found = []
-        for groups in joint_groupings(joints) if self._options.gains_of_each_joint else ():
-            finer = len(np.unique(groups))
-            if finer > len(np.unique(model.gain_groups)):
-                found.append(attrs.evolve(model, gain_groups=groups))
-            if finer > len(np.unique(model.delay_groups)):
-                found.append(attrs.evolve(model, delay_groups=groups))
-        # Most finer groupings gain less than their parameters cost, which few steps show.
-        begun = self.evaluator.fit_each(found, iterations=TRIAL_ITERATIONS)
-        return self.evaluator.fit_each([one.model for one in begun if one.criterion < before.criterion])
 
     def eliminate(self, fitted: FittedModel, kept: int = 0) -> FittedModel:
         """Remove effects that are no longer significant (backward elimination).
