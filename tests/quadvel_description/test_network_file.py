@@ -93,6 +93,11 @@ def kind(number: int) -> Change:
     return lambda model: setattr(model.graph.initializer[0], "data_type", number)
 
 
+def padded(model: ModelProto) -> None:
+    model.graph.node[0].op_type = "Conv"
+    model.graph.node[0].attribute.append(helper.make_attribute("pads", [0, 10**9]))
+
+
 def many(model: ModelProto) -> None:
     model.graph.node.extend([helper.make_node("Identity", ["x"], [f"x{i}"]) for i in range(50_000)])
 
@@ -132,6 +137,7 @@ def test_a_harmless_network_is_read_as_it_is(tmp_path: Path) -> None:
             operator("Expand"),
             "operator 'Expand' of node 'product' expands to .'W'., expected the output of a Shape",
         ),
+        (padded, "operator 'Conv' of node 'product' has the attribute pads .0, 1000000000."),
         (branch, "operator 'If'"),
         (from_elsewhere, "operators come from the sets ai.onnx 17, com.evil 1, expected ai.onnx 11 to 21"),
         (lambda model: setattr(model.graph.node[0], "domain", "com.evil"), "operator 'com.evil.MatMul'"),

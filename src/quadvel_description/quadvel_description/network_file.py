@@ -27,7 +27,7 @@ UNUSED_DOMAINS = ("ai.onnx.ml",)
 
 # Operators of ONNX's own domain. None of them runs a subgraph, draws random numbers, or creates an
 # output whose size is the value of an input, but Expand, which is allowed only to the shape of
-# another value.
+# another value, and Conv, which is allowed only without padding.
 ALLOWED_OPERATORS = """
     Abs Acos Add And Asin Atan Cast Clip Concat Constant Conv Cos Div Elu Equal Erf Exp Expand Flatten Floor GRU
     Gather Gemm Greater GreaterOrEqual HardSigmoid Identity LSTM LayerNormalization LeakyRelu Less LessOrEqual Log
@@ -93,7 +93,7 @@ def read_network(path: Path) -> Message:
 
 def _find_problems(model: Message) -> Iterator[str]:
     """Yield a sentence for everything that is not allowed."""
-    operators, known = ALLOWED_OPERATORS.split(), ALLOWED_PARTS.split()
+    known = ALLOWED_PARTS.split()
     parts = list(islice(model.parts(), MAX_PARTS + 1))
     shapes = {
         name
@@ -117,20 +117,27 @@ def _find_problems(model: Message) -> Iterator[str]:
         elif not part.is_readable():
             yield f"has a part {place} with a text that is not UTF-8, expected names that can be read"
         elif part.kind == "NodeProto":
-            domain, operator = part.one("domain", ""), part.one("op_type", "")
-            if domain or operator not in operators:
-                name = f"{domain}.{operator}" if domain else operator
-                yield (
-                    f"operator {name!r} of node {part.one('name', '')!r} is not one of those that are run: "
-                    + " ".join(operators)
-                )
-            elif operator == "Expand" and not shapes.issuperset(part.all("input")[1:]):
-                yield (
-                    f"operator 'Expand' of node {part.one('name', '')!r} expands to {part.all('input')[1:]}, "
-                    "expected the output of a Shape: no size is a number in the file"
-                )
+            yield from _find_node_problems(part, shapes)
         elif part.kind == "TensorProto":
             yield from _find_tensor_problems(part)
+
+
+def _find_node_problems(node: Message, shapes: set[str]) -> Iterator[str]:
+    """Yield a sentence for an operator that is not allowed; `shapes` are the outputs of all Shapes."""
+    domain, operator, name = node.one("domain", ""), node.one("op_type", ""), node.one("name", "")
+    padding = [one.all("ints") for one in node.all("attribute") if one.one("name", "") == "pads"]
+    if domain or operator not in ALLOWED_OPERATORS.split():
+        full = f"{domain}.{operator}" if domain else operator
+        yield f"operator {full!r} of node {name!r} is not one of those that are run: " + " ".join(
+            ALLOWED_OPERATORS.split()
+        )
+    elif operator == "Expand" and not shapes.issuperset(node.all("input")[1:]):
+        yield (
+            f"operator 'Expand' of node {name!r} expands to {node.all('input')[1:]}, "
+            "expected the output of a Shape: no size is a number in the file"
+        )
+    elif operator == "Conv" and any(map(any, padding)):
+        yield f"operator 'Conv' of node {name!r} has the attribute pads {padding[0]}, expected zeros"
 
 
 def _find_tensor_problems(tensor: Message) -> Iterator[str]:

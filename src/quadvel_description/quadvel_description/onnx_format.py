@@ -61,7 +61,7 @@ GraphProto: 1 node NodeProto*, 2 name text, 5 initializer TensorProto*, 10 doc_s
 NodeProto: 1 input text*, 2 output text*, 3 name text, 4 op_type text, 5 attribute AttributeProto*, 6 doc_string text,
     7 domain text, 8 overload text, 9 metadata_props StringStringEntryProto*, 10 device_configurations unread*
 AttributeProto: 1 name text, 2 f float, 3 i int, 4 s bytes, 5 t TensorProto, 6 g unread, 7 floats opaque*,
-    8 ints opaque*, 9 strings bytes*, 10 tensors unread*, 11 graphs unread*, 13 doc_string text, 14 tp unread,
+    8 ints int*, 9 strings bytes*, 10 tensors unread*, 11 graphs unread*, 13 doc_string text, 14 tp unread,
     15 type_protos unread*, 20 type int, 21 ref_attr_name text, 22 sparse_tensor unread, 23 sparse_tensors unread*
 TensorProto: 1 dims int*, 2 data_type int, 3 segment unread, 4 float_data opaque*, 5 int32_data opaque*,
     6 string_data bytes*, 7 int64_data opaque*, 8 name text, 9 raw_data bytes, 10 double_data opaque*,
