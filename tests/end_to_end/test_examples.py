@@ -166,6 +166,7 @@ LEFT_OUT_KINDS = {
     r"python -m quadvel_training (?!--help).*": "minutes to hours; tests/training runs each stage for some steps",
     r"torchrun .*": "the same",
     r"python -m benchmarks\.(tracking|identification) (enter|judge|publish|table).*": "minutes; tests/benchmarks runs parts",
+    r"quadvel robot check .*": "the tutorial on other robots runs it; test_found_robot.py has files",
     r"quadvel policy import .*|python -m benchmarks\.imported_walk .*": "test_imported.py has policies",
     r"pixi run .*": "needs pixi and the network",
     r"mkdir -p out/checkpoints .*": "takes a checkpoint out of the history",

@@ -22,11 +22,10 @@ from .stack import PARAMETERS, Stack
 ROBOT, SIMULATOR, LOGS, EVALUATION = PANELS = ("Robot", "Simulator", "Logs", "Evaluation")
 """Panels of the help, in order."""
 EXAMPLES = """\
-Usage: quadvel COMMAND [ARGS]...   For example:
+Usage: quadvel [--version | --install-completion] COMMAND [ARGS]... For example:
   quadvel demo               walk a simulated robot; results in out/demo
   quadvel up --view          run the simulated robot with the operator page
   quadvel drive --vx 0.5     drive it, from another terminal"""
-OPTIONS = "Options: --version, --help, --install-completion, --show-completion"
 
 # In help texts, \b on a line keeps the format of the lines up to the next empty one.
 NODE_LIST = "\n".join(f"  {name:18} {entry.about}" for name, entry in NODES.items())
@@ -60,7 +59,7 @@ class _PanelGroup(TyperGroup):
             for name, command in self.commands.items():
                 if getattr(command, "rich_help_panel", None) == panel:
                     lines.append(f"  {name:11} {command.get_short_help_str(66)}")
-        formatter.write("\n".join([*lines, OPTIONS, ""]))
+        formatter.write("\n".join([*lines, ""]))
 
 
 PLAIN: Any = {"add_completion": False, "rich_markup_mode": None, "pretty_exceptions_enable": False}
