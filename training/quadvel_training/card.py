@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from quadvel_description.network_file import read_network
+from quadvel_description.network_file import metadata_texts, read_network
 from quadvel_description.recurrent_network import METADATA_KEY
 from quadvel_estimator.features import KIND
 from quadvel_eval.compare import comparison_figures, read_evaluation
@@ -70,8 +70,7 @@ ESTIMATOR = "A recurrent estimator of the AlienGo's linear velocity from IMU, en
 
 def _metadata(network: Path) -> dict[str, Any]:
     """Read the metadata of a network file."""
-    entries = read_network(network).all("metadata_props")
-    texts = {entry.one("key"): entry.one("value") for entry in entries}
+    texts = metadata_texts(read_network(network))
     if METADATA_KEY not in texts:
         raise ValueError(f"{network}: no metadata {METADATA_KEY}, expected a policy or an estimator")
     found: dict[str, Any] = json.loads(texts[METADATA_KEY])

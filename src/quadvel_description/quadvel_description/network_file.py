@@ -91,6 +91,18 @@ def read_network(path: Path) -> Message:
     return model
 
 
+def metadata_texts(model: Message) -> dict[str, str]:
+    """Return the texts that a network carries as metadata.
+
+    Args:
+        model: The network, a "ModelProto".
+
+    Returns:
+        Text by key.
+    """
+    return {entry.one("key"): entry.one("value", "") for entry in model.all("metadata_props")}
+
+
 def _find_problems(model: Message) -> Iterator[str]:
     """Yield a sentence for everything that is not allowed."""
     known = ALLOWED_PARTS.split()

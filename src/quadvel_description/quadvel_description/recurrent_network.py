@@ -33,12 +33,29 @@ MEMORY_INPUTS = ("h_in", "c_in")
 MEMORY_OUTPUTS = ("h_out", "c_out")
 
 
-def single_thread_options() -> onnxruntime.SessionOptions:
-    """Create options of a session that runs on one thread.
+def open_session(path: Path, model: Message) -> onnxruntime.InferenceSession:
+    """Open a session of a network, or of a part of it, that runs on one thread.
+
+    Args:
+        path: Its file, for the error.
+        model: The network.
 
     Returns:
-        The options.
+        The session.
+
+    Raises:
+        NetworkFileError: onnxruntime cannot read the network.
     """
+    try:
+        return onnxruntime.InferenceSession(
+            serialise(model), _session_options(), providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:  # onnxruntime's exceptions share no other base
+        raise NetworkFileError(f"{path}: is not an ONNX network that onnxruntime can read") from error
+
+
+def _session_options() -> onnxruntime.SessionOptions:
+    """Return options of a session that runs on one thread."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
@@ -93,7 +110,7 @@ class RecurrentNetwork:
         """
         self.path = Path(path)
         self._model = read_network(self.path)
-        self._session = self._open_session(self._model)
+        self._session = open_session(self.path, self._model)
         self.metadata = self._read_metadata(("schema", "joint_names", "state_shape", *fields))
         self._require("metadata field schema", self.metadata["schema"], SCHEMA)
         self._require("metadata field robot", self.metadata["robot"], robot)
@@ -161,7 +178,7 @@ class RecurrentNetwork:
         models = ahead.split_network(self._model, "obs")
         if models is None:
             return None
-        before, after = map(self._open_session, models)
+        before, after = (open_session(self.path, part) for part in models)
         handed_over = {end.name: np.zeros(end.shape, np.float32) for end in before.get_outputs()}
         return self._make_runs(before, handed_over), self._make_runs(after, handed_over)
 
@@ -222,17 +239,6 @@ class RecurrentNetwork:
         """Raise the mismatch error if values differ."""
         if found != expected:
             raise self.mismatch_error(what, found, expected)
-
-    def _open_session(self, model: Message) -> onnxruntime.InferenceSession:
-        """Return a session of the network or of a part of it."""
-        try:
-            return onnxruntime.InferenceSession(
-                serialise(model), single_thread_options(), providers=["CPUExecutionProvider"]
-            )
-        except Exception as error:  # onnxruntime's exceptions share no other base
-            raise NetworkFileError(
-                f"{self.path}: is not an ONNX network that onnxruntime can read"
-            ) from error
 
     def _read_metadata(self, fields: Sequence[str]) -> dict[str, Any]:
         """Return the metadata and check that the fields exist."""

@@ -124,6 +124,18 @@ def build_observation(
     return out
 
 
+def ticks_per_step(rate_hz: float) -> int:
+    """Return for how many ticks of the control loop an action of a policy is held.
+
+    Args:
+        rate_hz: Rate of the policy, Hz.
+
+    Returns:
+        Whole number of ticks, at least 1.
+    """
+    return max(round(RATE_HZ / rate_hz), 1)
+
+
 class Observer:
     """Builds the input of a policy's network from what is measured."""
 
@@ -352,7 +364,7 @@ class PolicyMetadata:
     @property
     def ticks_per_step(self) -> int:
         """Ticks of the control loop for which an action is held."""
-        return max(round(RATE_HZ / self.rate_hz), 1)
+        return ticks_per_step(self.rate_hz)
 
     @property
     def observer(self) -> Observer:

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.network_file import NetworkFileError, read_network
+from quadvel_description.network_file import NetworkFileError, metadata_texts, read_network
 from quadvel_description.recurrent_network import RecurrentNetwork
 from quadvel_description.robot import Robot
 from quadvel_description.robot_name import shipped_file
 
-from .imported.policy import ImportedPolicy, metadata_text
+from .imported.metadata import IMPORTED_KEY
+from .imported.policy import ImportedPolicy
 from .observation import JOINTS, RATE_HZ, REQUIRED_FIELDS, MetadataError, PolicyMetadata
 
 _POLICIES = Path(__file__).parent / "policies"
@@ -52,9 +53,10 @@ def load_policy(robot: Robot, path: str | Path | None = None) -> PolicyFile | Im
             the name of the file.
     """
     path = shipped_policy(robot) if path is None else Path(path)
-    if metadata_text(read_network(path)) is None:
-        return PolicyFile(robot, path)
-    return ImportedPolicy(robot, path)
+    model = read_network(path)
+    if IMPORTED_KEY in metadata_texts(model):
+        return ImportedPolicy(robot, path, model)
+    return PolicyFile(robot, path)
 
 
 class PolicyFile:

@@ -11,7 +11,7 @@ from typing import Any
 import attrs
 
 from quadvel_description.bounded_yaml import read_yaml
-from quadvel_description.network_file import NetworkFileError, read_network
+from quadvel_description.network_file import NetworkFileError, metadata_texts, read_network
 from quadvel_description.onnx_format import Message, message, serialise
 from quadvel_description.robot import Robot
 
@@ -93,7 +93,7 @@ def _read_mjlab(
     robot: Robot, weights: Path, model: Message, output: str, supplement: Supplement
 ) -> ImportedMetadata:
     """Read the metadata of the ONNX file."""
-    metadata = {entry.one("key"): entry.one("value", "") for entry in model.all("metadata_props")}
+    metadata = metadata_texts(model)
     if not mjlab.is_mjlab(metadata):
         raise FormatError(
             f"{weights}: metadata: found {sorted(metadata) or 'nothing'}, expected mjlab's "

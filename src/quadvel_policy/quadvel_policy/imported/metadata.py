@@ -1,4 +1,4 @@
-"""What an imported policy needs besides its weights: the JSON object in its ONNX file.
+"""What an imported policy needs in addition to its weights: the JSON object in its ONNX file.
 
 The readers of the formats create it, `ImportedPolicy` runs it.
 """
@@ -16,7 +16,16 @@ from quadvel_description.fields import field, refusal
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.records import structure_record
 
-from ..observation import COMMAND_AXES, FIELD_CHECKS, JOINTS, RATE_HZ, Bounds, Vector, VelocityCommandLimits
+from ..observation import (
+    COMMAND_AXES,
+    FIELD_CHECKS,
+    JOINTS,
+    RATE_HZ,
+    Bounds,
+    Vector,
+    VelocityCommandLimits,
+    ticks_per_step,
+)
 from .observation import ImportedAction, ImportedObserver, ImportedTerm
 
 IMPORTED_KEY = "quadvel_imported"
@@ -90,7 +99,7 @@ class ImportedMetadata:
     @property
     def ticks_per_step(self) -> int:
         """Ticks of the control loop for which an action is held."""
-        return max(round(RATE_HZ / self.rate_hz), 1)
+        return ticks_per_step(self.rate_hz)
 
     @property
     def size(self) -> int:

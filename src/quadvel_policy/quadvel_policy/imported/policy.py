@@ -8,9 +8,9 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from quadvel_description.network_file import NetworkFileError, read_network
-from quadvel_description.onnx_format import Message, serialise
-from quadvel_description.recurrent_network import single_thread_options
+from quadvel_description.network_file import NetworkFileError, metadata_texts, read_network
+from quadvel_description.onnx_format import Message
+from quadvel_description.recurrent_network import open_session
 from quadvel_description.robot import Robot
 
 from .metadata import IMPORTED_KEY, ImportedMetadata
@@ -36,7 +36,7 @@ class ImportedPolicy:
         """
         path = Path(path)
         model = read_network(path) if model is None else model
-        text = metadata_text(model)
+        text = metadata_texts(model).get(IMPORTED_KEY)
         if text is None:
             raise NetworkFileError(f"{path}: has no metadata under the key {IMPORTED_KEY!r}, expected them")
         try:
@@ -48,9 +48,7 @@ class ImportedPolicy:
                 f"{path}: metadata field robot is {self.metadata.robot!r}, expected {robot.name!r}"
             )
         self._path, self._output = path, self.metadata.output
-        self._session = onnxruntime.InferenceSession(
-            serialise(model), single_thread_options(), providers=["CPUExecutionProvider"]
-        )
+        self._session = open_session(path, model)
         self._input = _only_input(path, self._session, self.metadata.size)
         self._check_output()
 
@@ -91,20 +89,6 @@ class ImportedPolicy:
             raise NetworkFileError(
                 f"{self._path}: shape of output {self._output} is {result.shape}, expected {expected}"
             )
-
-
-def metadata_text(model: Message, key: str = IMPORTED_KEY) -> str | None:
-    """Find a value in the metadata of a network.
-
-    Args:
-        model: The network.
-        key: The key.
-
-    Returns:
-        The value, or None if there is none.
-    """
-    values = {entry.one("key"): entry.one("value", "") for entry in model.all("metadata_props")}
-    return values.get(key)
 
 
 def _only_input(path: Path, session: onnxruntime.InferenceSession, size: int) -> str:
