@@ -1,9 +1,10 @@
 """Scripted trot that the teacher's network corrects.
 
 Feet follow the gait clock: swings rise and return, stances sweep at the planned velocity. Four
-feedbacks of the true state keep robots on their feet on level ground: feet are placed by the excess
-velocity, the trunk is levelled and kept at its height, feet turn against a wrong yaw rate. Their
-gains were found by a search over walks of robots drawn as in training, with a trained correction.
+feedbacks of the true state keep nominal robots on their feet to 2.5 m/s on level ground: feet are
+placed by the excess velocity, the trunk is levelled and kept at its height, feet turn against a wrong
+yaw rate. Their gains were found by a search over walks of robots drawn as in training, with a
+trained correction.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
     # place on the way, from 1 to -1 in stance and back in swing: 1 - 2 phase / duty, -cos(pi s)
     along = np.where(down, 1.0 - 2.0 * phases / duty[:, None], -np.cos(np.pi * swing))
     along *= clock.walking[:, None]
-    # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_planned) - BEHIND_S v_planned
+    # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_planned) - BEHIND_S clip(v_planned)
     #     + TURN_S (w_z - w_planned) x (x_nominal)
     placed = PLACEMENT_S * excess - BEHIND_S * np.clip(planned[:, :2], -MAX_BEHIND, MAX_BEHIND)
     feet = np.broadcast_to(below, (n, 4, 3)).copy()

@@ -103,7 +103,7 @@ def _shape(found: FoundRobot) -> Iterator[Finding]:
     )
     for kind, offsets, zero in places:
         aside = np.abs(offsets[:, list(zero)]).max()
-        along = "beside its hip joint" if kind == "thigh" else "straight below the joint before"
+        along = "next to its hip joint" if kind == "thigh" else "straight below the joint before"
         if aside > MAX_OFFSET or (kind != "thigh" and (offsets[:, 2] >= 0).any()):
             yield Finding(
                 "zero_posture",

@@ -198,7 +198,7 @@ def to_our_order(values: Vector, joint_map: tuple[int, ...]) -> Vector:
 
 
 def _finite(value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return finite numbers as an array; an array of a shape that nobody asks for if it is anything else."""
+    """Return finite numbers as an array; an array without elements for anything else."""
     nothing = np.empty((0, 0, 0))
     if isinstance(value, bool | str) or value is None:
         return nothing

@@ -1,4 +1,4 @@
-"""Reader of unitree_rl_lab's `deploy.yaml`, the file beside each policy that Isaac Lab exports for a Unitree robot."""
+"""Reader of unitree_rl_lab's `deploy.yaml`, which it writes with each policy for a Unitree robot."""
 
 from __future__ import annotations
 
