@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from quadvel_sysid.logs.check_log import CheckedLog, check_log
+from quadvel_sysid.logs.checks.slopes import resting_rows
 from quadvel_sysid.logs.checks.table import markdown_table
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
@@ -98,6 +99,18 @@ def test_speeds_of_a_coarse_encoder_are_recomputed(tmp_path: Path, seed: int) ->
     )
     assert rms(found.log.dq - log["dq"]) < 0.2 * rms(dq - log["dq"])
     assert rms(found.log.q - log["q"]) < 0.5 * rms(q - log["q"])
+
+
+def test_a_coarse_encoder_rests_where_it_stays_on_one_count_for_long() -> None:
+    t, tick = 0.004 * np.arange(500), 0.006
+    moving = (t < 0.8) | (t > 1.2)
+    angle = np.cumsum(0.5 * 0.004 * moving)  # 0.5 rad/s, and a pause
+    q = np.stack([np.round(angle / tick) * tick, angle], axis=1)
+    found = resting_rows(t, q, np.array([tick, 0.0]))
+    assert found[205:298, 0].all()
+    assert not found[:195].any()
+    assert not found[305:].any()
+    assert not found[:, 1].any()
 
 
 def test_coarse_speeds_that_the_drive_used_are_kept(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from .channels import (
     slope_at_rows,
 )
 from .response import measure_response
-from .slopes import encoder_step, smooth_motion
+from .slopes import encoder_step, resting_rows, smooth_motion
 from .torque import lacks_sign
 
 WRAP_TOLERANCE_RAD = 1.0
@@ -120,8 +120,12 @@ def unusable_speed(log: Log) -> Iterator[Finding | Log]:
     for kind, hit, text in cases:
         if hit.any():
             made = smooth_motion(log.t, log.q, log.tau)
+            resting = hit & resting_rows(log.t, log.q, coarse)
             mended = attrs.evolve(
-                log, q=np.where(hit & (coarse > 0.0), made.q, log.q), dq=np.where(hit, made.dq, log.dq)
+                log,
+                q=np.where(hit & (coarse > 0.0), made.q, log.q),
+                dq=np.where(hit, made.dq, log.dq),
+                valid=log.valid & ~resting,
             )
             if "dq" not in log.derived and _explained_share(mended) < _explained_share(log):
                 text += ": but the drive acted on it, so it stays as logged"
@@ -130,6 +134,11 @@ def unusable_speed(log: Log) -> Iterator[Finding | Log]:
                 )
             else:
                 text += f" by cubics over {1e3 * made.window_s:.3g} ms"
+                if resting.any():
+                    text += (
+                        f"; left out: {100.0 * resting.mean():.2g} % of the values, where q rests on one "
+                        "count, so that the sign of the speed is not known"
+                    )
                 yield Finding(
                     kind, "dq", log.joints_where(hit), text.format(format_names(log.joints_where(hit)))
                 )

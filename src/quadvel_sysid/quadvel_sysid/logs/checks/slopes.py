@@ -17,7 +17,7 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from quadvel_description.arrays import Floats
+from quadvel_description.arrays import Bools, Floats
 
 from ..log import GAP_FACTOR
 
@@ -27,6 +27,10 @@ POLYNOMIAL_ORDER = 3
 """A cubic: its slope at the middle row has no error from the second and the fourth derivative."""
 MAX_SELECTION_ROWS = 20_000
 """Consecutive rows on which the width is chosen, at most."""
+RESTING_SPEED_RAD_S = 0.1
+"""Speed below which a coarse encoder rests: friction depends on the sign of the speed, which a pause on
+one count hides.
+"""
 
 
 @attrs.frozen(eq=False)
@@ -127,4 +131,24 @@ def encoder_step(q: Floats) -> Floats:
         of_grid = (values - values[0]) / step
         if np.mean(np.abs(of_grid - np.round(of_grid)) < 0.1) > 0.95:
             found[j] = step
+    return found
+
+
+def resting_rows(t: Floats, q: Floats, step: Floats) -> Bools:
+    """Find the rows in which a coarse encoder stays on one count for long.
+
+    Args:
+        t: (N,) times, s.
+        q: (N, J) measured angles, rad.
+        step: (J,) step of each encoder, rad; 0 for a fine one.
+
+    Returns:
+        (N, J) whether q keeps its value for longer than `step` at `RESTING_SPEED_RAD_S`.
+    """
+    found = np.zeros(q.shape, dtype=bool)
+    for j in np.flatnonzero(step > 0.0):
+        first = np.concatenate([[0], 1 + np.flatnonzero(np.diff(q[:, j]) != 0.0)])  # row of each pause
+        end = np.append(t[first[1:]], t[-1])
+        pause = np.repeat(end - t[first], np.diff(first, append=len(t)))
+        found[:, j] = pause > step[j] / RESTING_SPEED_RAD_S
     return found
