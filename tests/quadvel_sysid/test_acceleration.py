@@ -1,6 +1,7 @@
 """Accelerations from logged speeds, against motions known in closed form."""
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from quadvel_sysid.data.acceleration import local_slope, split_acceleration
 
@@ -32,14 +33,39 @@ def test_acceleration_is_sharp_where_a_command_arrives():
         row = np.searchsorted(sent_at, at, side="right") - 1
         return q_des[row], sums[row] + q_des[row] * (at - sent_at[row])[:, None]
 
+    def speed(at):
+        return come(at - delay)[1] @ answer - 40.0 / 12.0 * np.cos(12.0 * at[:, None] + [0.0, 1.0])
+
     jumps, integral = come(t - delay)
-    swing = 40.0 * np.sin(12.0 * t[:, None] + [0.0, 1.0])
-    ddq = jumps @ answer + swing
-    dq = integral @ answer + 40.0 / 12.0 * -np.cos(12.0 * t[:, None] + [0.0, 1.0])
-    dq += 0.002 * rng.standard_normal(dq.shape)
+    ddq = jumps @ answer + 40.0 * np.sin(12.0 * t[:, None] + [0.0, 1.0])
+    fine = np.arange(t[0], t[-1] + 1e-4, 1e-4)
+    angle = cumulative_trapezoid(speed(fine), fine, axis=0, initial=0.0)
+    q = np.stack([np.interp(t, fine, one) for one in angle.T], axis=1)
+    dq = speed(t) + 0.002 * rng.standard_normal(q.shape)
     smeared = np.sqrt(np.mean((local_slope(t, dq, 0.008) - ddq) ** 2))
-    smooth, found = split_acceleration("ddq_smooth", t, dq, local_slope(t, dq, 0.008), integral)
+    smooth, found = split_acceleration("ddq_smooth", t, (q, dq), local_slope(t, dq, 0.008), integral)
     sharp = np.sqrt(np.mean((smooth + jumps @ found - ddq) ** 2))
     np.testing.assert_allclose(found, answer, rtol=0.03, atol=10.0)
     assert smeared > 100.0  # rad/s^2
     assert sharp < 3.0
+
+
+def test_acceleration_is_sharp_in_a_log_slower_than_the_motion():
+    """A joint under a PD law, whose own motion changes the slope of dq as much as the commands do."""
+    rng, stiffness, damping, tick = np.random.default_rng(2), 900.0, 30.0, 1e-4  # 1/s^2, 1/s, s
+    t = np.arange(0.0, 6.0, tick)
+    smooth_target = 0.4 * np.sin(6.0 * t) + 0.1 * np.sin(23.0 * t)
+    target = smooth_target[(t // 0.01 * 0.01 / tick).astype(int)]
+    q, dq, states = 0.0, 0.0, np.empty((len(t), 3))
+    for k, wanted in enumerate(target):
+        ddq = stiffness * (wanted - q) - damping * dq
+        states[k] = q, dq, ddq
+        dq += tick * ddq
+        q += tick * dq
+    rows = np.arange(23, len(t), 50)  # every 5 ms
+    at, acting = t[rows], (np.cumsum(target) * tick)[rows, None]
+    angle, speed = (states[rows, k][:, None] + 1e-3 * rng.standard_normal((len(rows), 1)) * k for k in (0, 1))
+    smooth, found = split_acceleration("ddq_sharp", at, (angle, speed), local_slope(at, speed, 0.002), acting)
+    np.testing.assert_allclose(found, [[stiffness]], rtol=0.05)
+    error = smooth[:, 0] + target[rows] * found[0, 0] - states[rows, 2]
+    assert np.sqrt(np.mean(error**2)) < 0.03 * np.sqrt(np.mean(states[rows, 2] ** 2))

@@ -3,7 +3,8 @@
 A slope of dq over some milliseconds blurs the steps that a command causes in the torque, and so
 in ddq. The size of these steps follows from the speeds themselves. Let s be the integral of q_des
 as it acts, D the slope over a window of rows, and B the response (rad/s^2 of each joint for 1 rad
-of each command) that maps changes of slope of s to changes of slope of dq. Then
+of each command) that maps changes of slope of s to changes of slope of dq, apart from what angles and
+speeds change. Then
 
     ddq = D dq + B (q_des - D s).
 """
@@ -78,23 +79,30 @@ def _slope_change(t: Array, values: Array) -> Array:
 
 
 def split_acceleration(
-    name: str, t: Array, dq: Array, slope_of_dq: Array, acting: Array
+    name: str, t: Array, states: tuple[Array, Array], slope_of_dq: Array, acting: Array
 ) -> tuple[Array, Array]:
     """Split an acceleration into a smooth part and the response to commands.
 
     Args:
         name: `ddq_sharp` or `ddq_smooth`; selects the half width.
         t: (N,) times, s.
-        dq: (N, J) speeds, rad/s.
+        states: (N, J) angles q, rad, and (N, J) speeds dq, rad/s.
         slope_of_dq: (N, J) slope D dq, rad/s^2.
         acting: (N, J) integral s of q_des as it acts, rad s.
 
     Returns:
         D dq - B D s (N, J), rad/s^2, and B transposed (J, J), 1/s^2.
     """
-    # B from changes of slope: (D_after - D_before) dq = B (D_after - D_before) s, in least squares.
-    half_width, cause, outcome = HALF_WIDTHS_S[name], _slope_change(t, acting), _slope_change(t, dq)
-    answer: Array = np.asarray(
-        np.linalg.lstsq(cause.T @ cause, cause.T @ outcome, rcond=1e-6)[0], dtype=float
-    )
-    return slope_of_dq - local_slope(t, acting, half_width) @ answer, answer
+    # Joints under a PD law accelerate by ddq = B q_des + P q + V dq + a slow part. The change of
+    # slope M x = (D_after - D_before) x of the integral of both sides is, in least squares,
+    #     M dq = B M s + P M (integral of q) + V M q.
+    # Without P and V, B would make up for the motion between the rows of a slow log.
+    q, dq = states
+    q_integral = np.zeros(q.shape)
+    q_integral[1:] = np.cumsum(0.5 * np.diff(t)[:, None] * (q[1:] + q[:-1]), axis=0)
+    cause = _slope_change(t, np.concatenate([acting, q_integral, q], axis=1))
+    scale = np.sqrt(np.mean(cause**2, axis=0)) + 1e-12  # the units of the causes differ
+    cause, outcome = cause / scale, _slope_change(t, dq)
+    solved = np.linalg.lstsq(cause.T @ cause, cause.T @ outcome, rcond=1e-6)[0]
+    response: Array = np.asarray(solved / scale[:, None], dtype=float)[: q.shape[1]]
+    return slope_of_dq - local_slope(t, acting, HALF_WIDTHS_S[name]) @ response, response

@@ -153,8 +153,9 @@ class LogSignals:
             if len(self._smooth) >= _MAX_CACHED_SLOPES:
                 self._smooth.pop(next(iter(self._smooth)))
             target_integral = self._read_targets(self.t, delays, self._integral)
+            states = as_double(self.log.q), as_double(self.log.dq)
             self._smooth[key] = split_acceleration(
-                name, self.t, as_double(self.log.dq), self._slope_of_dq(name), target_integral
+                name, self.t, states, self._slope_of_dq(name), target_integral
             )
         # ddq = smooth + B q_des, with the command as it acts at `at`.
         smooth, response = self._smooth[key]

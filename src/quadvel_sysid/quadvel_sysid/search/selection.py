@@ -129,15 +129,15 @@ class Search:
         effects = self.extend(effects, EFFECTS, record, most=2, bound=regressors.criterion)
         if not effects.is_white:
             regressors = self.extend(regressors, REGRESSORS, record)
+        # Among models with nearly equal criteria the one with the fewest regressors counts.
         models, bound = [regressors], regressors.criterion
-        if effects.is_white or not regressors.is_white or effects.criterion < bound:
+        margin = EQUIVALENCE_MARGIN * len(self.evaluator.noise)
+        if effects.is_white or not regressors.is_white or effects.criterion < bound + margin:
             effects = self.prune(self.extend(effects, EFFECTS, record, bound=bound))
             models.append(effects)
             if not effects.is_white:
                 models.append(self.extend(effects, REGRESSORS, record, bound=bound))
-        # Among models with nearly equal criteria the one with the fewest regressors counts.
         least = min(one.criterion for one in models)
-        margin = EQUIVALENCE_MARGIN * len(self.evaluator.noise)
         equivalent = [one for one in models if one.criterion < least + margin]
         key = _regressor_count if self._options.effects_before_regressors else _criterion
         return SearchResult(self.prune(min(equivalent, key=key)), effects, record)
