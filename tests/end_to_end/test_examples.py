@@ -18,7 +18,6 @@ from pathlib import Path
 import attrs
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
@@ -218,9 +217,8 @@ def _bare(line: str) -> str:
 
 
 def _helps() -> Iterator[tuple[str, str]]:
-    group = typer.main.get_command(cli.app)
-    for name in ("", *group.commands):  # type: ignore[attr-defined]
-        asked = [name, "--help"] if name else ["--help"]
+    for name in ("", *cli.command_names()):
+        asked = [*name.split(), "--help"]
         yield name, CliRunner().invoke(cli.app, asked, env={"COLUMNS": "200"}).output
 
 

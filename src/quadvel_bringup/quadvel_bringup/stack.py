@@ -70,7 +70,7 @@ class Stack:
         low_level: Key of LOW_LEVELS.
         parameters: Parameter file.
         robot: Name of the robot, or path of a robot.yaml.
-        policy: ONNX file of the policy.
+        policy: ONNX file of the policy, or `none`.
         terrain: "flat", "slope" or "rough".
         world: Name or file of a world.
         actuator: YAML file of the actuator model.
@@ -118,7 +118,7 @@ class Stack:
             ValueError: An option needs a simulated robot.
         """
         low_level = LOW_LEVELS[self.low_level]
-        policy = None if self.policy is None else str(self.policy.resolve())
+        policy = absolute_file(None if self.policy is None else str(self.policy))
         urgent: Parameters = URGENT if low_level.urgent else {}
         robot = _given(robot=absolute_file(self.robot))
         followers: dict[str, Parameters] = {
@@ -165,15 +165,16 @@ class Stack:
 
 
 def absolute_file(chosen: str | None) -> str | None:
-    """Make the file of a world or robot absolute.
+    """Make the path of a world, robot or policy absolute.
 
     Args:
-        chosen: The file, the name of a shipped one, or None.
+        chosen: The file or folder, the name of a shipped one or of another choice, or None.
 
     Returns:
         The absolute path; a name and None unchanged.
     """
-    return str(Path(chosen).resolve()) if chosen and Path(chosen).suffix else chosen
+    is_path = chosen and (Path(chosen).suffix or len(Path(chosen).parts) > 1 or Path(chosen).is_dir())
+    return str(Path(chosen).resolve()) if chosen and is_path else chosen
 
 
 def _given(**values: str | None) -> Parameters:

@@ -51,7 +51,7 @@ def demo_command(
         typer.Argument(help="A walk in all directions, or following a person through a world."),
     ] = "walk",
     robot: Annotated[
-        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or a robot.yaml.")
+        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or the folder of a robot.")
     ] = DEFAULT_ROBOT,
     out: Annotated[
         Path | None,

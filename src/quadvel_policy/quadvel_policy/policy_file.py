@@ -21,6 +21,8 @@ from .observation import JOINTS, RATE_HZ, REQUIRED_FIELDS, MetadataError, Policy
 
 _POLICIES = Path(__file__).parent / "policies"
 SHIPPED_POLICY = _POLICIES / "crl_eam.onnx"
+NO_POLICY = "none"
+"""Choice of a robot that only stands up, stands and lies down."""
 
 
 def shipped_policy(robot: Robot) -> Path:
@@ -57,6 +59,22 @@ def load_policy(robot: Robot, path: str | Path | None = None) -> PolicyFile | Im
     if IMPORTED_KEY in metadata_texts(model):
         return ImportedPolicy(robot, path, model)
     return PolicyFile(robot, path)
+
+
+def chosen_policy(robot: Robot, choice: str) -> PolicyFile | ImportedPolicy | None:
+    """Load the policy that a user chose.
+
+    Args:
+        robot: The robot that the policy has to belong to.
+        choice: The ONNX file, "" for the shipped one, or NO_POLICY.
+
+    Returns:
+        The policy; None for NO_POLICY.
+
+    Raises:
+        NetworkFileError: As `load_policy`.
+    """
+    return None if choice == NO_POLICY else load_policy(robot, choice or None)
 
 
 class PolicyFile:

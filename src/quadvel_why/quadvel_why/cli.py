@@ -40,7 +40,7 @@ def why_command(
         str | None,
         typer.Option(
             metavar="<name|file>",
-            help="The robot: aliengo, go2 or a robot.yaml.",
+            help="The robot: aliengo, go2 or the folder of a robot.",
             show_default="as recorded, or aliengo",
         ),
     ] = None,
