@@ -95,8 +95,16 @@ class PolicyFile:
             NetworkFileError: The file is missing or is not a policy for this robot and rate; one
                 sentence with the name of the file.
         """
-        path = shipped_policy(robot) if path is None else path
-        network = RecurrentNetwork(path, robot.name, {"actions": JOINTS}, REQUIRED_FIELDS)
+        path = shipped_policy(robot) if path is None else Path(path)
+        try:
+            network = RecurrentNetwork(path, robot.name, {"actions": JOINTS}, REQUIRED_FIELDS)
+        except NetworkFileError:
+            if IMPORTED_KEY not in metadata_texts(read_network(path)):
+                raise
+            raise NetworkFileError(
+                f"{path}: found a policy of another project ({IMPORTED_KEY}), expected one of this project: "
+                "imported policies run with up and eval"
+            ) from None
         try:
             self.metadata = PolicyMetadata.from_fields(network.metadata)
         except MetadataError as error:
