@@ -61,10 +61,11 @@ def robot_name(found: FoundRobot) -> str:
         found: The robot.
 
     Returns:
-        The name of its model, else of its file; letters, digits and underscores in lower case.
+        The name of its model, else of its file, without `_description`; letters, digits and
+        underscores in lower case.
     """
     named = found.name if found.name not in ("", "MuJoCo Model") else found.path.stem
-    return re.sub(r"\W+", "_", named.lower())
+    return re.sub(r"\W+", "_", named.lower()).removesuffix("_description")
 
 
 def proposed_posture(found: FoundRobot, share: float) -> Array | None:
