@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from quadvel_description.robot import load_robot, shipped_robots
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import shipped_robots
 
 ROOT = Path(__file__).parents[2]
 MODULES = [path for folder in ("src", "training") for path in (ROOT / folder).rglob("*.py")]

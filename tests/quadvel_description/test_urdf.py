@@ -9,7 +9,8 @@ import pytest
 from quadvel_description import kinematics, mjcf
 from quadvel_description.frames import BASE
 from quadvel_description.quadruped import JOINT_NAMES, LEGS
-from quadvel_description.robot import Robot, load_robot, shipped_robots
+from quadvel_description.robot import Robot, load_robot
+from quadvel_description.robot_name import shipped_robots
 from quadvel_description.urdf_generator import generate_folder_urdf
 
 KEEP_FIXED_LINKS = '<mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'

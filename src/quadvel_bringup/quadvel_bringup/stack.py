@@ -8,6 +8,8 @@ from pathlib import Path
 
 import attrs
 
+from quadvel_description.robot_name import shipped_robots
+
 from .nodes import Parameters, process_command, ros_arguments
 
 PARAMETERS = Path(__file__).parent / "config" / "params.yaml"
@@ -173,8 +175,11 @@ def absolute_file(chosen: str | None) -> str | None:
     Returns:
         The absolute path; a name and None unchanged.
     """
-    is_path = chosen and (Path(chosen).suffix or len(Path(chosen).parts) > 1 or Path(chosen).is_dir())
-    return str(Path(chosen).resolve()) if chosen and is_path else chosen
+    if chosen is None or chosen in shipped_robots():
+        return chosen
+    path = Path(chosen)
+    is_path = path.suffix or len(path.parts) > 1 or (path / "robot.yaml").is_file()
+    return str(path.resolve()) if is_path else chosen
 
 
 def _given(**values: str | None) -> Parameters:

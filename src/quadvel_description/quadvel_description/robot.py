@@ -24,23 +24,13 @@ from .fields import field, positive, refusal, to_array
 from .inertia import Inertial, combine_inertials
 from .quadruped import JOINT_NAMES, LEGS
 from .records import read_document, structure_record
-from .robot_name import UNNAMED_ROBOT
+from .robot_name import ROBOTS, UNNAMED_ROBOT, shipped_robots
 from .symmetry import mirror_joints
 from .urdf import read_links
 
 SCHEMA = 1
 UNDECIDED = "to_decide"
 """Value of a field in a `robot.yaml` that its user still has to decide."""
-_SHIPPED = Path(__file__).parent / "robots"
-
-
-def shipped_robots() -> tuple[str, ...]:
-    """List the robots that ship with the package.
-
-    Returns:
-        Their names.
-    """
-    return tuple(sorted(file.parent.name for file in _SHIPPED.glob("*/robot.yaml")))
 
 
 @cache
@@ -58,7 +48,7 @@ def load_robot(robot: str) -> Robot:
         ValueError: A file of its folder is wrong; the message names file, field, value found and
             expectation.
     """
-    path = Path(robot) if robot not in shipped_robots() else _SHIPPED / robot
+    path = Path(robot) if robot not in shipped_robots() else ROBOTS / robot
     file = path / "robot.yaml" if path.is_dir() else path
     if not file.is_file():
         names = ", ".join(shipped_robots())
@@ -191,7 +181,7 @@ class Drive:
     """
 
     board: str = field("external", one_of=("external", "unitree_udp", "unitree_dds"))
-    no_state_hint: str = "does its software run?"
+    no_state_hint: str = ""
     dropped_out_mode: int | None = None
 
 
