@@ -15,7 +15,6 @@ import os
 import socket
 import struct
 import uuid
-from functools import cache
 from typing import Any
 
 from cyclonedds import builtin, core
@@ -73,15 +72,30 @@ def domain_configuration() -> str:
     return ",".join(filter(None, [own, os.environ.get("CYCLONEDDS_URI")]))
 
 
-@cache
+_joined: dict[int, Domain] = {}
+"""Domains that this process has joined as ROS does, by number; `leave_domains` deletes them."""
+
+
 def _join(domain_id: int) -> Domain:
-    """Join a domain as the ROS environment variables say.
+    """Join a domain as the ROS environment variables say, or return it if it is joined.
 
     Without a CYCLONEDDS_URI the sockets are bound to the loopback interface.
     """
-    settings = domain_configuration()
-    alone = LOOPBACK in settings and not os.environ.get("CYCLONEDDS_URI")
-    return open_domain(domain_id, settings, "lo" if alone else "")
+    if domain_id not in _joined:
+        settings = domain_configuration()
+        alone = LOOPBACK in settings and not os.environ.get("CYCLONEDDS_URI")
+        _joined[domain_id] = open_domain(domain_id, settings, "lo" if alone else "")
+    return _joined[domain_id]
+
+
+def leave_domains() -> None:
+    """Leave all domains that were joined as ROS does; to be called before the interpreter ends.
+
+    Cyclone's garbage collector frees topics of Python, and Python ends any other thread that calls
+    it once the interpreter ends. The deletion of the domain would then wait for it forever.
+    """
+    while _joined:
+        delete(_joined.popitem()[1])
 
 
 def open_domain(domain_id: int, settings: str, device: str) -> Domain:
