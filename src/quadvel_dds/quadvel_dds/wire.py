@@ -30,6 +30,9 @@ from cyclonedds.util import duration
 from quadvel_dds import idl, messages
 
 ANY = int(core.SampleState.Any | core.ViewState.Any | InstanceState.Any)
+# Functions of Cyclone that its Python layer wraps.
+_waitset_wait = core.WaitSet._dll_handle.dds_waitset_wait
+_count_readers = DataWriter._dll_handle.dds_get_matched_subscriptions
 REQUEST_HEADER = struct.Struct("<Qq")
 MAX_PARTICIPANTS = 32  # on one host, as rmw_cyclonedds sets it
 # Cyclone drops discovery data of other hosts on this interface; ROS 2 finds local nodes on it.
@@ -277,7 +280,7 @@ class Writer:
         Returns:
             Number of readers.
         """
-        return len(self._matched())
+        return max(int(_count_readers(self.dds._ref, None, 0)), 0)  # below 0: the participant has left
 
     def _matched(self) -> list[int]:
         """Return Cyclone's handles of the readers that receive the samples."""
@@ -407,8 +410,10 @@ class WaitSet:
             Readers that have data; None among them if `wake` was called.
         """
         places = self._triggered
-        count = self.dds._waitset_wait(self.dds._ref, places, len(places), timeout_ns)
-        found = {self._reader_at[place] for place in places[: max(count, 0)] if place}
+        count = _waitset_wait(self.dds._ref, places, len(places), timeout_ns)
+        if count <= 0:
+            return set()
+        found = {self._reader_at[place] for place in places[:count] if place}
         if None in found:
             with contextlib.suppress(DDSException):  # the participant has left
                 self.guard.take()
