@@ -145,6 +145,7 @@ LEFT_OUT = {
     "quadvel eval --grid quick --out out/eval": "minutes; tests/quadvel_eval/test_grid.py runs some of its walks",
     "quadvel eval --grid quick --policy NETWORK.onnx --out out/eval": "the same",
     "quadvel eval --grid quick --robot go2 --policy go2.onnx --estimator kalman": "the same",
+    "quadvel eval --grid quick --robot go2 --policy kaiwu.onnx --estimator kalman --out out/kaiwu": "the same",
     "quadvel eval --grid paper --seeds 3 --cluster tcp://scheduler:8786": "needs a cluster; tests/quadvel_eval has one",
     "quadvel bench --out out/bench.json": "minutes, and only of use on an idle machine",
     "quadvel bench --live": "a minute, and only of use on an idle machine",
