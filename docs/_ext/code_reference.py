@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import typer
 from sphinx.application import Sphinx
 from typer.testing import CliRunner
 
@@ -39,15 +38,12 @@ def commands() -> str:
     Returns:
         Markdown, with a heading for each command.
     """
-    group = typer.main.get_command(cli.app)
     parts = []
-    for name in group.commands:  # type: ignore[attr-defined]
-        for inner in getattr(cli.command(name), "commands", [""]):
-            words = f"{name} {inner}".split()
-            shown = CliRunner().invoke(
-                cli.app, [*words, "--help"], env={"COLUMNS": str(COLUMNS)}, prog_name="quadvel"
-            )
-            parts.append(f"## quadvel {' '.join(words)}\n\n{_fenced(shown.output, 'text')}")
+    for name in cli.command_names():
+        shown = CliRunner().invoke(
+            cli.app, [*name.split(), "--help"], env={"COLUMNS": str(COLUMNS)}, prog_name="quadvel"
+        )
+        parts.append(f"## quadvel {name}\n\n{_fenced(shown.output, 'text')}")
     return "\n".join(parts)
 
 

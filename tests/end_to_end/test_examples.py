@@ -5,9 +5,11 @@ Examples are the indented and the fenced blocks of the documents, and the comman
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -18,14 +20,15 @@ from pathlib import Path
 import attrs
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_bringup import cli
+from quadvel_bringup.__main__ import main
 from quadvel_bringup.processes import ProcessGroup
 from quadvel_policy.policy_file import SHIPPED_POLICY
 from tests.helpers.robots import ALIENGO
+from tests.quadvel_sysid.joint_logs import fields, mcap
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("*.md", "docs/**/*.md", "src/*/README.md", "training/README.md", "ros_ws/README.md")
@@ -46,13 +49,14 @@ class Step:
 ROBOT = [
     Step("quadvel up --terrain rough", served=True, then=READY),
     Step("quadvel status"),
-    Step("quadvel drive --vx 0.5 --wz 0.3 --seconds 5", more="--seconds 3"),
-    Step("quadvel drive --vx 0.5"),
-    Step("quadvel drive --vx 0.5 --seconds 40 &", more="--seconds 8", served=True),
-    Step("quadvel record low_state low_cmd --out walk.mcap --seconds 30", more="--seconds 3"),
-    Step("quadvel identify walk.mcap --out out/identify", more="--joints FR_calf"),
+    Step("quadvel drive --vx 0.5 --wz 0.3 --seconds 5", more="--seconds 1.5"),
+    Step("quadvel drive --vx 0.5", more="--seconds 1.5"),
     Step("quadvel push --fy 60"),
-    Step("quadvel record low_state low_cmd --out walk.mcap", more="--seconds 1 --out other.mcap"),
+    Step(
+        "quadvel record low_state low_cmd --out walk.mcap --seconds 30",
+        more="--seconds 0.5 --out first.mcap",
+    ),
+    Step("quadvel record low_state low_cmd --out walk.mcap", more="--seconds 0.5 --out second.mcap"),
     Step("quadvel reset"),
     Step("quadvel reset --terrain slope --slope 0.175"),
     Step("quadvel mode passive"),
@@ -66,7 +70,8 @@ EXCITE = [
     Step("quadvel identify sweep.mcap --out out/identify", more="--joints FR_calf"),
     Step("quadvel up --actuator out/identify/actuator.yaml", served=True, then=READY),
 ]
-LOGS = [  # of one leg each
+LOGS = [  # of one leg each, or of twelve joints
+    Step("quadvel identify walk.mcap --out out/identify", more="--joints FR_calf"),
     Step("quadvel identify walk_1.npz --holdout walk_2.npz --gains 35 0.5 --robot go2 --out out/identify"),
     Step("quadvel identify walk_1.npz --joints FR_hip FR_thigh FR_calf --out out/identify"),
     Step("quadvel identify hung.npz --gains 30 0.5 --out out/identify"),
@@ -111,6 +116,7 @@ LEFT_OUT = {
     "--out out/identify": "the same",
     "quadvel replay walk.mcap --actuator out/identify/actuator.yaml": "a replay of another recording; "
     "tests/quadvel_eval/test_recorded_joints.py has several",
+    "quadvel drive --vx 0.5 --seconds 40 &": "the other drives, behind the next commands",
     "quadvel record --out fall.mcap": "as the other recordings",
     "quadvel why fall.mcap": "tests/quadvel_why/test_why.py asks it about a walk and its changes",
     "quadvel why fall.mcap --policy mine.onnx": "the same",
@@ -138,6 +144,8 @@ LEFT_OUT = {
     "quadvel twin my_plant.yaml": "the same with a plant of the user's",
     "quadvel eval --grid quick --out out/eval": "minutes; tests/quadvel_eval/test_grid.py runs some of its walks",
     "quadvel eval --grid quick --policy NETWORK.onnx --out out/eval": "the same",
+    "quadvel eval --grid quick --robot go2 --policy go2.onnx --estimator kalman": "the same",
+    "quadvel eval --grid quick --robot go2 --policy kaiwu.onnx --estimator kalman --out out/kaiwu": "the same",
     "quadvel eval --grid paper --seeds 3 --cluster tcp://scheduler:8786": "needs a cluster; tests/quadvel_eval has one",
     "quadvel bench --out out/bench.json": "minutes, and only of use on an idle machine",
     "quadvel bench --live": "a minute, and only of use on an idle machine",
@@ -218,9 +226,8 @@ def _bare(line: str) -> str:
 
 
 def _helps() -> Iterator[tuple[str, str]]:
-    group = typer.main.get_command(cli.app)
-    for name in ("", *group.commands):  # type: ignore[attr-defined]
-        asked = [name, "--help"] if name else ["--help"]
+    for name in ("", *cli.command_names()):
+        asked = [*name.split(), "--help"]
         yield name, CliRunner().invoke(cli.app, asked, env={"COLUMNS": "200"}).output
 
 
@@ -241,6 +248,7 @@ def test_every_example_runs_or_is_left_out_for_a_reason() -> None:
 def sandbox(tmp_path: Path) -> Path:
     """A folder with the files that the examples take for there."""
     shutil.copy(SHIPPED_POLICY, tmp_path / "my.onnx")
+    mcap(tmp_path / "walk.mcap", fields(seconds=2.0))
     (tmp_path / "out" / "loop").mkdir(parents=True)
     for seed, name in enumerate(("walk_1", "walk_2", "hung", "out/loop/walk")):
         np.savez(tmp_path / f"{name}.npz", **leg_log(seed, with_torque=name != "hung"))
@@ -281,12 +289,25 @@ def test_the_examples_run(name: str, sandbox: Path) -> None:
             if step.served:
                 group.start(step.example, ["env", "-C", str(sandbox), *line])
                 _wait_for(step, group, said)
-            else:
+            elif words[0] == "quadvel":
                 assert set(group.ended().values()) <= {0}, said[-5:]
-                ended = subprocess.run(line, cwd=sandbox, capture_output=True, text=True, timeout=300)
-                assert ended.returncode == 0, f"{step.example}\n{ended.stdout}{ended.stderr}"
+                assert _run_here(line[len(PROGRAMS["quadvel"]) :], sandbox) == 0, step.example
+            else:
+                subprocess.run(line, cwd=sandbox, timeout=300, check=True)
         codes = group.stop()
     assert not any(codes.values()), f"{codes}: {said[-5:]}"
+
+
+def _run_here(words: list[str], folder: Path) -> int:
+    """Run a command of quadvel in this process, which has loaded most of it, and return its exit code."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    try:
+        with contextlib.chdir(folder), pytest.raises(SystemExit) as ended:
+            main(words)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    code = ended.value.code
+    return code if isinstance(code, int) else 0 if code is None else 1
 
 
 def _wait_for(step: Step, group: ProcessGroup, said: list[str]) -> None:

@@ -20,18 +20,13 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
-import typer
 
 from quadvel_bringup import cli
 from quadvel_bringup.__main__ import main
 from quadvel_eval.grid import SCHEMA
 from tests.quadvel_sysid.joint_logs import fields, mcap
 
-COMMANDS = tuple(
-    f"{name} {inner}".strip()
-    for name in typer.main.get_group(cli.app).commands
-    for inner in getattr(cli.command(name), "commands", [""])
-)
+COMMANDS = tuple(cli.command_names())
 LONGEST = 60  # s, in which a command has to see what is wrong with its arguments
 NAMES_OR_FILES = {("world", "world"), ("twin", "plants")}
 """Arguments that take the name of something shipped, or a file"""
@@ -50,7 +45,7 @@ NEEDED = {
     "plot": ["walk.mcap"],
     "policy import": ["policy.onnx"],
     "replay": ["walk.mcap"],
-    "robot": ["check", "robot.xml"],
+    "robot check": ["robot.xml"],
     "run": ["sim_node"],
     "twin": ["dry_gears"],
     "why": [LOG],
@@ -94,20 +89,13 @@ class Place:
         return [*self.command.split(), *needed[:index], value, *needed[index + 1 :]]
 
 
-def command(name: str) -> Any:
-    """A command, such as `eval` or `policy import`."""
-    outer, *inner = name.split()
-    found = cli.command(outer)
-    return found.commands[inner[0]] if inner else found
-
-
 def parameters(name: str) -> list[Any]:
-    return list(command(name).params)
+    return list(cli.command(name).params)
 
 
 def types(name: str) -> dict[str, str]:
     """The types of a command's parameters as they are written in its function."""
-    callback = command(name).callback
+    callback = cli.command(name).callback
     assert callback is not None
     return {key: str(hint) for key, hint in typing.get_type_hints(inspect.unwrap(callback)).items()}
 
@@ -269,7 +257,7 @@ def suffixes(place: Place) -> tuple[str, ...]:
         )
     if place.option in ("first", "second", "--after"):
         return (".json",)
-    if place.command == "robot":
+    if place.command == "robot check":
         return (".xml", ".urdf")
     return (".xml", ".urdf", ".yaml") if place.option == "--robot" else (".yaml",)
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import attrs
 import pytest
 
 from quadvel_bringup import up
 from quadvel_bringup.preflight import NODE_CHECKS, check_arguments, check_stack
 from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
+from quadvel_description.robot import load_robot
 from quadvel_policy.policy_file import SHIPPED_POLICY
 
 
@@ -31,6 +33,23 @@ def test_the_shipped_stack_is_in_order() -> None:
     assert set(NODE_CHECKS) == {
         name for low_level in LOW_LEVELS for name in Stack(low_level=low_level).node_parameters()
     }
+
+
+def test_a_robot_without_a_policy_may_stand() -> None:
+    check_stack(Stack(robot="go2", policy=Path("none"), estimator="kalman"))
+
+
+@pytest.mark.parametrize("low_level", ["driver", "board"])
+def test_a_robot_without_a_board_that_is_known_here_has_no_driver(tmp_path: Path, low_level: str) -> None:
+    for file in load_robot("go2").folder.iterdir():
+        text = file.read_text()
+        (tmp_path / file.name).write_text(text.partition("drive:")[0] if file.suffix == ".yaml" else text)
+    stack = Stack(robot=str(tmp_path), policy=Path("none"), estimator="kalman", low_level=low_level)
+    with pytest.raises(
+        ValueError, match=r"robot\.yaml: drive\.board: found 'external', expected unitree_udp or"
+    ):
+        check_stack(stack)
+    check_stack(attrs.evolve(stack, low_level="external"))
 
 
 @pytest.mark.parametrize(

@@ -173,6 +173,17 @@ def test_every_node_that_has_to_know_the_robot_is_told_its_name_or_file() -> Non
     assert file == str(Path("mine/robot.yaml").resolve())
 
 
+def test_the_folder_of_a_robot_may_be_named_but_hides_no_shipped_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("mine", "go2"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "robot.yaml").touch()
+    told = [Stack(robot=name).node_parameters()["estimator"]["robot"] for name in ("mine", "go2", "spot")]
+    assert told == [str(tmp_path / "mine"), "go2", "spot"]
+
+
 def test_what_a_robot_cannot_do_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match="low_level is 'board', expected 'sim' for simulated time"):
         Stack(low_level="board", use_sim_time=True)

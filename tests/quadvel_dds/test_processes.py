@@ -50,6 +50,19 @@ def main():
 main()
 """
 
+EXIT = """
+import atexit
+from pathlib import Path
+
+def print_threads():
+    print(*(path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")))
+
+atexit.register(print_threads)  # registered first, so it runs last
+import rclpy
+rclpy.init()
+node = rclpy.create_node("ends")
+"""
+
 
 def wait_until(node: Node, condition: Callable[[], object], timeout: float = 40.0) -> None:
     deadline = time.monotonic() + timeout
@@ -83,6 +96,14 @@ def test_ctrl_c_interrupts_a_spin_that_waits(program: Program) -> None:
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=40)
     assert (process.returncode, output, errors) == (0, "interrupted\n", "")
+
+
+def test_threads_of_the_middleware_end_before_the_interpreter(program: Program) -> None:
+    """Python ends a thread that calls it later, and a deletion of the domain waits for it."""
+    process = program(EXIT)
+    output, _ = process.communicate(timeout=60.0)
+    assert process.returncode == 0
+    assert not {"recv", "tev", "gc", "dq.builtins"} & set(output.split()), output
 
 
 def test_discovery_stays_on_this_host_unless_asked_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:

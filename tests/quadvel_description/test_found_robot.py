@@ -10,7 +10,8 @@ import pytest
 from quadvel_description.found_robot import FoundRobot, UnsupportedRobotError, find_robot
 from quadvel_description.found_robot_checks import check_found_robot
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import load_robot, shipped_robots
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import shipped_robots
 from tests.helpers.third_robot import write_third_robot
 
 

@@ -6,7 +6,8 @@ import pytest
 
 from quadvel_description import kinematics, mjcf
 from quadvel_description.quadruped import GRAVITY, JOINT_NAMES, LEGS
-from quadvel_description.robot import Robot, load_robot, shipped_robots
+from quadvel_description.robot import Robot, load_robot
+from quadvel_description.robot_name import shipped_robots
 
 
 @pytest.fixture(params=shipped_robots())

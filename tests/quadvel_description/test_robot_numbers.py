@@ -9,15 +9,16 @@ from pathlib import Path
 import pytest
 import yaml
 
-from quadvel_description.robot import load_robot, shipped_robots
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import shipped_robots
 
 ROOT = Path(__file__).parents[2]
 MODULES = [path for folder in ("src", "training") for path in (ROOT / folder).rglob("*.py")]
 ANY_ROBOT = {1.5708}  # a right angle, rad
 
 
-def peculiar_numbers(robot: str) -> set[float]:
-    """Numbers of robot.yaml with four digits and more: two sources do not agree on them by chance."""
+def peculiar_numbers(name: str) -> set[float]:
+    """Numbers of robot.yaml, ranges and heights with four digits and more: no two sources agree on them by chance."""
 
     def numbers(value: object) -> Iterator[float]:
         if isinstance(value, dict | list):
@@ -26,9 +27,13 @@ def peculiar_numbers(robot: str) -> set[float]:
         elif isinstance(value, float):
             yield abs(value)
 
-    content = yaml.safe_load((load_robot(robot).folder / "robot.yaml").read_text())
+    robot = load_robot(name)
+    content = yaml.safe_load((robot.folder / "robot.yaml").read_text())
+    derived = [*robot.lower.tolist(), *robot.upper.tolist(), robot.nominal_height, robot.lie_height]
     return {
-        one for one in numbers(content) if len(f"{one:.12g}".replace(".", "").lstrip("0")) >= 4
+        one
+        for one in numbers(content | {"derived": derived})
+        if len(f"{one:.12g}".replace(".", "").lstrip("0")) >= 4
     } - ANY_ROBOT
 
 

@@ -9,8 +9,9 @@ import pytest
 from quadvel_description import kinematics, mjcf
 from quadvel_description.frames import BASE
 from quadvel_description.quadruped import JOINT_NAMES, LEGS
-from quadvel_description.robot import Robot, load_robot, shipped_robots
-from quadvel_description.urdf_generator import generate_urdf
+from quadvel_description.robot import Robot, load_robot
+from quadvel_description.robot_name import shipped_robots
+from quadvel_description.urdf_generator import generate_folder_urdf
 
 KEEP_FIXED_LINKS = '<mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
 
@@ -120,6 +121,6 @@ def test_links_form_one_tree_below_a_root_without_inertia(robot):
 
 def test_the_urdf_of_the_go2_is_the_generated_one():
     go2 = load_robot("go2")
-    assert go2.urdf_file.read_text() == generate_urdf(go2.folder), (
+    assert go2.urdf_file.read_text() == generate_folder_urdf(go2.folder), (
         "python -m quadvel_description.urdf_generator"
     )

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -22,6 +25,29 @@ def test_every_call_is_answered_once_by_another_process_of_this_machine() -> Non
     answers = dict(run_in_parallel([(divmod, k, 3) for k in range(7)] + [(os.getpid,)]))
     assert [answers[k] for k in range(7)] == [divmod(k, 3) for k in range(7)]
     assert answers[7] != os.getpid()
+
+
+CALLS_FOR_LONG = """
+import os, time
+from quadvel_eval.pool import run_in_parallel
+if __name__ == "__main__":
+    for _, answer in run_in_parallel([(os.getpid,), (time.sleep, 600.0), (time.sleep, 600.0)]):
+        print(answer, flush=True)
+"""
+
+
+def test_workers_end_with_a_process_that_is_killed(tmp_path: Path) -> None:
+    (tmp_path / "calls.py").write_text(CALLS_FOR_LONG)
+    with subprocess.Popen(
+        [sys.executable, tmp_path / "calls.py"], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        worker = int(process.stdout.readline())
+        process.kill()
+    until = time.monotonic() + 20.0
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{worker}").exists()
 
 
 def test_every_call_is_answered_once_by_a_worker_of_the_cluster(cluster: str) -> None:

@@ -23,7 +23,7 @@ from quadvel_bringup import cli
         ("follow --low-level board", "--low-level"),
         ("follow --loss 0.1", "--loss"),
         ("follow --jitter 2", "--jitter"),
-        ("follow --lockstep", "--lockstep"),
+        ("follow --tour --lockstep", "--lockstep"),
         ("follow --actuator mine.yaml", "--actuator"),
         ("follow --video", "--video"),
         ("follow --metres 5", "--metres"),

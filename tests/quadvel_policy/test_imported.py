@@ -18,6 +18,7 @@ import pytest
 import yaml
 from onnx import TensorProto, helper, numpy_helper
 
+from quadvel_bringup import cli
 from quadvel_description.kinematics import rotate
 from quadvel_description.network_file import NetworkFileError
 from quadvel_description.quadruped import JOINT_NAMES
@@ -483,8 +484,15 @@ def test_an_imported_file_loads_for_its_robot_alone(imported: Path) -> None:
     assert isinstance(load_policy(GO2, imported), ImportedPolicy)
     with pytest.raises(NetworkFileError, match="robot is 'go2', expected 'aliengo'"):
         load_policy(ALIENGO, imported)
-    with pytest.raises(NetworkFileError):
+    with pytest.raises(
+        NetworkFileError, match=r"out\.onnx: found a policy of another project \(quadvel_imported\)"
+    ):
         PolicyFile(GO2, imported)
+
+
+def test_the_figures_of_the_paper_are_refused_for_an_imported_policy(imported: Path) -> None:
+    with pytest.raises(NetworkFileError, match="expected one of this project: imported policies run with up"):
+        cli.command("paper").main(["--robot", "go2", "--policy", f"mine={imported}"], standalone_mode=False)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from quadvel_bringup import cli
+from quadvel_policy.imported.importer import Supplement
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import Diagnosis, diagnose
 from quadvel_why.links import CAUSES
@@ -19,6 +20,7 @@ from quadvel_why.reading import read_run
 from quadvel_why.run import Commands, Run
 from quadvel_why.signals import PARTS, Signals
 from tests.helpers.robots import ALIENGO
+from tests.quadvel_policy.test_imported import MJLAB, import_policy, write_network
 
 ORDER = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
 
@@ -129,6 +131,27 @@ def test_the_command_writes_the_finding_and_ends_with_1(run: Run, tmp_path: Path
     assert ended.value.code == 1
     assert json.loads((tmp_path / "out" / "why.json").read_text())["finding"]["cause"]
     assert (tmp_path / "out" / "why.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("policy", ["none", "imported.onnx"])
+def test_without_a_policy_to_replay_the_other_causes_are_examined(
+    policy: str,
+    walk: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_network(tmp_path / "policy.onnx", 48, MJLAB)
+    supplement = Supplement(limits=(1.0, 0.5, 1.0), rate_hz=50.0)
+    import_policy(ALIENGO, tmp_path / "policy.onnx", None, tmp_path / "imported.onnx", supplement)
+    with pytest.raises(SystemExit) as ended:
+        cli.command("why").main([str(walk), "--policy", policy])
+    assert ended.value.code == 0
+    answer = json.loads((tmp_path / "out/why/why.json").read_text())
+    assert answer["finding"] is None
+    assert {"other_actions", "action_scale", "memory_reset"} <= answer["skipped"].keys()
+    assert ("is of another project" in capsys.readouterr().err) == (policy != "none")
 
 
 def test_every_cause_has_a_row_and_knows_what_it_needs() -> None:

@@ -302,7 +302,7 @@ def limit(
     backward: Annotated[float | None, typer.Option(help="Fastest backward, m/s.", min=0.0)] = None,
     sideways: Annotated[float | None, typer.Option(help="Fastest to either side, m/s.", min=0.0)] = None,
     turn: Annotated[float | None, typer.Option(help="Fastest turn either way, rad/s.", min=0.0)] = None,
-    robot: Annotated[str, typer.Option(help="Robot of the policy: a name, or a robot.yaml.")] = DEFAULT_ROBOT,
+    robot: Annotated[str, typer.Option(help="Robot of the policy: a name, or its folder.")] = DEFAULT_ROBOT,
 ) -> None:
     """Narrow the commands that a policy file accepts; limits that are not given stay. Write its card again afterwards.
 

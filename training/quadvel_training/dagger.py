@@ -11,6 +11,7 @@ robots would stay with a student that falls soon.
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,8 @@ class DaggerConfig:
         n: number of robots, of all processes together.
         threads: threads of the physics.
         length: ticks per sequence; 64 are 0.32 s.
-        mini_batches: optimiser steps per sequence.
+        epochs: passes over each sequence.
+        mini_batches: optimiser steps per pass.
         learning_rate: at the start.
         final_learning_rate: at the end.
         driven: share of robots that the student drives at the end.
@@ -80,7 +82,8 @@ class DaggerConfig:
     n: int = 512
     threads: int = attrs.field(factory=available_cores)
     length: int = 64
-    mini_batches: int = 8
+    epochs: int = 2
+    mini_batches: int = 16
     learning_rate: float = 7e-4
     final_learning_rate: float = 7e-5
     driven: float = 0.9
@@ -319,7 +322,7 @@ class DaggerRun:
         return seen
 
     def learn(self, obs: Tensor, label: Tensor, mask: Tensor, start: State) -> float:
-        """Take an optimiser step for each mini-batch of robots.
+        """Take an optimiser step for each mini-batch of robots, in each pass.
 
         Args:
             obs: (T, N, 48), observations.
@@ -330,8 +333,9 @@ class DaggerRun:
         Returns:
             Mean loss.
         """
-        total = 0.0
-        for ids in torch.randperm(self.config.n).chunk(self.config.mini_batches):
+        c, total = self.config, 0.0
+        passes = [torch.randperm(c.n).chunk(c.mini_batches) for _ in range(c.epochs)]
+        for ids in itertools.chain(*passes):
             action, _ = self.student(obs[:, ids], select(start, ids))
             error = torch.nn.functional.huber_loss(
                 action, label[:, ids], reduction="none", delta=IMITATION_HUBER_DELTA
@@ -343,7 +347,7 @@ class DaggerRun:
             torch.nn.utils.clip_grad_norm_(self.student.parameters(), 1.0)
             self.optimiser.step()
             total += float(loss.detach())
-        return total / self.config.mini_batches
+        return total / sum(map(len, passes))
 
 
 def load_policy(checkpoint: Path) -> Recurrent:

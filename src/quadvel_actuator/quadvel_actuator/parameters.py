@@ -183,9 +183,22 @@ class ActuatorParameters:
             robot: The robot.
 
         Returns:
-            The parameters in the robot's folder.
+            The parameters in the robot's folder; without its file, those of a plain PD law.
         """
-        return cls.load(robot, robot.actuator_file)
+        if robot.actuator_file.exists():
+            return cls.load(robot, robot.actuator_file)
+        return cls(
+            schema=SCHEMA,
+            name=robot.name,
+            robot=robot.name,
+            kp_ref=robot.kp,
+            kd_ref=robot.kd,
+            delta_kp=0.0,
+            delta_kd=0.0,
+            pairs=(DelayPair(0.0, 0.0, 0.0),),
+            torque_noise=0.0,
+            torque_limit=tuple(robot.torque_limit.tolist()),
+        )
 
     @classmethod
     def ideal(cls, robot: Robot) -> ActuatorParameters:

@@ -23,7 +23,7 @@ ARGUMENTS = [
         "low_level", default_value="sim", choices=list(LOW_LEVELS), description="simulated or real robot"
     ),
     DeclareLaunchArgument(
-        "robot", default_value="", description="aliengo, go2 or a robot.yaml; empty: aliengo"
+        "robot", default_value="", description="aliengo, go2 or the folder of a robot; empty: aliengo"
     ),
     DeclareLaunchArgument("policy", default_value="", description="ONNX file; empty: the shipped one"),
     DeclareLaunchArgument(

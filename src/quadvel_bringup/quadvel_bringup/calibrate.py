@@ -44,7 +44,7 @@ def calibrate_command(
         ),
     ] = None,
     robot: Annotated[
-        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or a robot.yaml.")
+        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or the folder of a robot.")
     ] = DEFAULT_ROBOT,
     out: Annotated[Path, typer.Option(metavar="<file>", help="The file to write.")] = Path(
         "out/calibration.yaml"

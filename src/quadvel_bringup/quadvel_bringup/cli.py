@@ -56,7 +56,7 @@ class _PanelGroup(TyperGroup):
         lines = [EXAMPLES]
         for panel in PANELS:
             lines.append(typer.style(panel, bold=True))
-            for name, command in self.commands.items():
+            for name, command in sorted(self.commands.items(), key=lambda item: hasattr(item[1], "commands")):
                 if getattr(command, "rich_help_panel", None) == panel:
                     lines.append(f"  {name:11} {command.get_short_help_str(66)}")
         formatter.write("\n".join([*lines, ""]))
@@ -86,11 +86,11 @@ class DelegatedCommand:
 
 
 DELEGATED_COMMANDS = {
-    "robot": DelegatedCommand(
-        "quadvel_eval.robot_check:robot_command",
+    "robot check": DelegatedCommand(
+        "quadvel_eval.robot_check:check_command",
         "eval",
         ROBOT,
-        "Check the MJCF or URDF of a new quadruped.",
+        "Check the MJCF or URDF of a new quadruped, and write its folder.",
     ),
     "demo": DelegatedCommand(
         "quadvel_lab.demo:demo_command",
@@ -98,8 +98,8 @@ DELEGATED_COMMANDS = {
         SIMULATOR,
         "Walk a simulated robot in all directions, or after a person.",
     ),
-    "policy": DelegatedCommand(
-        "quadvel_bringup.import_policy:app",
+    "policy import": DelegatedCommand(
+        "quadvel_bringup.import_policy:import_command",
         "robot",
         ROBOT,
         "Import a policy of another project into one ONNX file.",
@@ -195,6 +195,7 @@ DELEGATED_COMMANDS = {
         "Benchmark the identification on plants with hidden effects.",
     ),
 }
+"""Commands of other modules by name; the first of two words is a group."""
 
 RUN_UNTIL_CTRL_C = ("run", "up", "drive", "record", "view", "teleop")
 """Commands that Ctrl-C ends with exit code 0.
@@ -226,7 +227,7 @@ def begin(
 @app.command(rich_help_panel=ROBOT)
 def doctor(
     robot: Annotated[
-        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or a robot.yaml.")
+        str, typer.Option(metavar="<name|file>", help="aliengo, go2 or the folder of a robot.")
     ] = DEFAULT_ROBOT,
     report: Annotated[
         bool, typer.Option("--report", help="Print a text for a bug report, with versions and system.")
@@ -286,11 +287,17 @@ def up(
     ] = "sim",
     robot: Annotated[
         str | None,
-        typer.Option(metavar="<name|file>", help="aliengo, go2 or a robot.yaml.", show_default=DEFAULT_ROBOT),
+        typer.Option(
+            metavar="<name|file>", help="aliengo, go2 or the folder of a robot.", show_default=DEFAULT_ROBOT
+        ),
     ] = None,
     policy: Annotated[
         Path | None,
-        typer.Option(metavar="<file>", help="ONNX file of the policy.", show_default="the shipped one"),
+        typer.Option(
+            metavar="<file>",
+            help="ONNX file of the policy; none: only stand.",
+            show_default="the shipped one",
+        ),
     ] = None,
     terrain: Annotated[
         str | None, typer.Option(metavar="<name>", help="flat, slope or rough.", show_default="flat")
@@ -353,7 +360,7 @@ def view(
         str | None,
         typer.Option(
             metavar="<name|file>",
-            help="aliengo, go2 or a robot.yaml.",
+            help="aliengo, go2 or the folder of a robot.",
             show_default="as recorded, or aliengo",
         ),
     ] = None,
@@ -572,14 +579,18 @@ def record(
         raise typer.Exit(1)
 
 
-def _register(name: str, delegated: DelegatedCommand) -> None:
-    """Register a delegated command.
+def _register(name: str, delegated: DelegatedCommand, groups: dict[str, typer.Typer]) -> None:
+    """Register a delegated command, in its group of `groups` if its name has two words.
 
     Its arguments are passed on, and its module is loaded when it runs.
     """
+    outer, _, inner = name.rpartition(" ")
+    if outer not in groups:
+        groups[outer] = typer.Typer(no_args_is_help=True, **PLAIN)
+        app.add_typer(groups[outer], name=outer, help=delegated.about, rich_help_panel=delegated.panel)
 
-    @app.command(
-        name,
+    @groups[outer].command(
+        inner,
         help=delegated.about,
         context_settings=PASS_THROUGH,
         add_help_option=False,
@@ -589,15 +600,28 @@ def _register(name: str, delegated: DelegatedCommand) -> None:
         command(name).main(context.args, prog_name=context.command_path)
 
 
+_groups = {"": app}
 for _name, _delegated in DELEGATED_COMMANDS.items():
-    _register(_name, _delegated)
+    _register(_name, _delegated, _groups)
+
+
+def command_names() -> list[str]:
+    """List all commands, those of groups with both words.
+
+    Returns:
+        Their names after `quadvel`, in the order of registration.
+    """
+    commands = typer.main.get_group(app).commands.items()
+    return [
+        f"{name} {inner}".strip() for name, found in commands for inner in getattr(found, "commands", [""])
+    ]
 
 
 def command(name: str) -> Any:
     """Return a command with all its arguments and options.
 
     Args:
-        name: Name of the command after `quadvel`.
+        name: Name of the command after `quadvel`, one of `command_names`.
 
     Returns:
         The command as a click object. KeyError is raised if there is none.

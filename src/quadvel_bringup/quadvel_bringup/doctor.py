@@ -99,7 +99,7 @@ def _robot() -> Finding:
         return Finding(
             "robot",
             True,
-            f"none runs; `quadvel up` uses the shipped actuator model (Table 4); {discovery_hint()}",
+            f"none runs; `quadvel up` uses the robot's own actuator model; {discovery_hint()}",
         )
     files = dict.fromkeys(  # each once, though several nodes report the robot
         f"{key} {node.values[key]}" for node in nodes.values() for key in FILE_KEYS if key in node.values

@@ -11,17 +11,7 @@ from quadvel_description.robot import load_robot
 from quadvel_policy.imported.importer import Supplement, import_policy
 from quadvel_recordings.output import atomic_write, output_file
 
-app = typer.Typer(
-    no_args_is_help=True, add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False
-)
 
-
-@app.callback()
-def begin() -> None:
-    """Import the policies of other projects."""
-
-
-@app.command("import")
 def import_command(
     weights: Annotated[Path, typer.Argument(help="ONNX file of the other project.", show_default=False)],
     out: Annotated[Path, typer.Option(metavar="<file>", help="ONNX file to write.")] = Path(

@@ -42,11 +42,11 @@ class NodeCheck:
 
 def _policy(settings: Any) -> object:
     """Check the limits, and load the policy; a shipped one has to exist."""
-    from quadvel_policy.policy_file import load_policy, shipped_policy
+    from quadvel_policy.policy_file import chosen_policy, shipped_policy
 
     robot = load_robot(settings.robot)
     settings.control.supervisor.check(robot)
-    return load_policy(robot, settings.policy) if settings.policy else shipped_policy(robot)
+    return chosen_policy(robot, settings.policy) if settings.policy else shipped_policy(robot)
 
 
 def _estimator(settings: Any) -> object:
@@ -63,10 +63,16 @@ def _estimator(settings: Any) -> object:
 NODE_CHECKS = {
     "sim_node": NodeCheck("quadvel_sim.parameters:SimParameters", lambda settings: settings.config()),
     "board": NodeCheck(
-        "quadvel_sim.parameters:BoardParameters", lambda settings: (settings.config(), settings.calibration())
+        "quadvel_sim.parameters:BoardParameters",
+        lambda settings: (
+            load_robot(settings.robot).require_board(),
+            settings.config(),
+            settings.calibration(),
+        ),
     ),
     "driver": NodeCheck(
-        "quadvel_driver.parameters:DriverParameters", lambda settings: settings.load_calibration()
+        "quadvel_driver.parameters:DriverParameters",
+        lambda settings: (load_robot(settings.robot).require_board(), settings.load_calibration()),
     ),
     "estimator": NodeCheck("quadvel_estimator.estimator:EstimatorParameters", _estimator),
     "controller": NodeCheck("quadvel_policy.controller:ControllerParameters", _policy),

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import attrs
 
+from quadvel_description.robot_name import shipped_robots
+
 from .nodes import Parameters, process_command, ros_arguments
 
 PARAMETERS = Path(__file__).parent / "config" / "params.yaml"
@@ -70,7 +72,7 @@ class Stack:
         low_level: Key of LOW_LEVELS.
         parameters: Parameter file.
         robot: Name of the robot, or path of a robot.yaml.
-        policy: ONNX file of the policy.
+        policy: ONNX file of the policy, or `none`.
         terrain: "flat", "slope" or "rough".
         world: Name or file of a world.
         actuator: YAML file of the actuator model.
@@ -118,7 +120,7 @@ class Stack:
             ValueError: An option needs a simulated robot.
         """
         low_level = LOW_LEVELS[self.low_level]
-        policy = None if self.policy is None else str(self.policy.resolve())
+        policy = absolute_file(None if self.policy is None else str(self.policy))
         urgent: Parameters = URGENT if low_level.urgent else {}
         robot = _given(robot=absolute_file(self.robot))
         followers: dict[str, Parameters] = {
@@ -165,15 +167,19 @@ class Stack:
 
 
 def absolute_file(chosen: str | None) -> str | None:
-    """Make the file of a world or robot absolute.
+    """Make the path of a world, robot or policy absolute.
 
     Args:
-        chosen: The file, the name of a shipped one, or None.
+        chosen: The file or folder, the name of a shipped one or of another choice, or None.
 
     Returns:
         The absolute path; a name and None unchanged.
     """
-    return str(Path(chosen).resolve()) if chosen and Path(chosen).suffix else chosen
+    if chosen is None or chosen in shipped_robots():
+        return chosen
+    path = Path(chosen)
+    is_path = path.suffix or len(path.parts) > 1 or (path / "robot.yaml").is_file()
+    return str(path.resolve()) if is_path else chosen
 
 
 def _given(**values: str | None) -> Parameters:

@@ -15,7 +15,6 @@ import os
 import socket
 import struct
 import uuid
-from functools import cache
 from typing import Any
 
 from cyclonedds import builtin, core
@@ -31,6 +30,9 @@ from cyclonedds.util import duration
 from quadvel_dds import idl, messages
 
 ANY = int(core.SampleState.Any | core.ViewState.Any | InstanceState.Any)
+# Functions of Cyclone that its Python layer wraps.
+_waitset_wait = core.WaitSet._dll_handle.dds_waitset_wait
+_count_readers = DataWriter._dll_handle.dds_get_matched_subscriptions
 REQUEST_HEADER = struct.Struct("<Qq")
 MAX_PARTICIPANTS = 32  # on one host, as rmw_cyclonedds sets it
 # Cyclone drops discovery data of other hosts on this interface; ROS 2 finds local nodes on it.
@@ -73,15 +75,30 @@ def domain_configuration() -> str:
     return ",".join(filter(None, [own, os.environ.get("CYCLONEDDS_URI")]))
 
 
-@cache
+_joined: dict[int, Domain] = {}
+"""Domains that this process has joined as ROS does, by number; `leave_domains` deletes them."""
+
+
 def _join(domain_id: int) -> Domain:
-    """Join a domain as the ROS environment variables say.
+    """Join a domain as the ROS environment variables say, or return it if it is joined.
 
     Without a CYCLONEDDS_URI the sockets are bound to the loopback interface.
     """
-    settings = domain_configuration()
-    alone = LOOPBACK in settings and not os.environ.get("CYCLONEDDS_URI")
-    return open_domain(domain_id, settings, "lo" if alone else "")
+    if domain_id not in _joined:
+        settings = domain_configuration()
+        alone = LOOPBACK in settings and not os.environ.get("CYCLONEDDS_URI")
+        _joined[domain_id] = open_domain(domain_id, settings, "lo" if alone else "")
+    return _joined[domain_id]
+
+
+def leave_domains() -> None:
+    """Leave all domains that were joined as ROS does; to be called before the interpreter ends.
+
+    Cyclone's garbage collector frees topics of Python, and Python ends any other thread that calls
+    it once the interpreter ends. The deletion of the domain would then wait for it forever.
+    """
+    while _joined:
+        delete(_joined.popitem()[1])
 
 
 def open_domain(domain_id: int, settings: str, device: str) -> Domain:
@@ -263,7 +280,7 @@ class Writer:
         Returns:
             Number of readers.
         """
-        return len(self._matched())
+        return max(int(_count_readers(self.dds._ref, None, 0)), 0)  # below 0: the participant has left
 
     def _matched(self) -> list[int]:
         """Return Cyclone's handles of the readers that receive the samples."""
@@ -393,8 +410,10 @@ class WaitSet:
             Readers that have data; None among them if `wake` was called.
         """
         places = self._triggered
-        count = self.dds._waitset_wait(self.dds._ref, places, len(places), timeout_ns)
-        found = {self._reader_at[place] for place in places[: max(count, 0)] if place}
+        count = _waitset_wait(self.dds._ref, places, len(places), timeout_ns)
+        if count <= 0:
+            return set()
+        found = {self._reader_at[place] for place in places[:count] if place}
         if None in found:
             with contextlib.suppress(DDSException):  # the participant has left
                 self.guard.take()

@@ -5,7 +5,9 @@ The folder of a robot, `robots/<name>` or one elsewhere, holds
     robot.yaml     numbers that no model file has: postures, gains, limits, friction, the drive
     robot.urdf     links, inertias and ranges of the joints; also shown by RViz and Foxglove
     robot.xml      MJCF with the shapes that touch the ground, for the simulation
-    actuator.yaml  actuator model, read by `quadvel_actuator`
+    actuator.yaml  actuator model, read by `quadvel_actuator`; without it, a plain PD law
+
+`quadvel robot check` writes the first three for a new robot (`robot_folder`).
 """
 
 from __future__ import annotations
@@ -22,21 +24,13 @@ from .fields import field, positive, refusal, to_array
 from .inertia import Inertial, combine_inertials
 from .quadruped import JOINT_NAMES, LEGS
 from .records import read_document, structure_record
-from .robot_name import UNNAMED_ROBOT
+from .robot_name import ROBOTS, UNNAMED_ROBOT, shipped_robots
 from .symmetry import mirror_joints
 from .urdf import read_links
 
 SCHEMA = 1
-_SHIPPED = Path(__file__).parent / "robots"
-
-
-def shipped_robots() -> tuple[str, ...]:
-    """List the robots that ship with the package.
-
-    Returns:
-        Their names.
-    """
-    return tuple(sorted(file.parent.name for file in _SHIPPED.glob("*/robot.yaml")))
+UNDECIDED = "to_decide"
+"""Value of a field in a `robot.yaml` that its user still has to decide."""
 
 
 @cache
@@ -54,12 +48,14 @@ def load_robot(robot: str) -> Robot:
         ValueError: A file of its folder is wrong; the message names file, field, value found and
             expectation.
     """
-    path = Path(robot) if robot not in shipped_robots() else _SHIPPED / robot
+    path = Path(robot) if robot not in shipped_robots() else ROBOTS / robot
     file = path / "robot.yaml" if path.is_dir() else path
     if not file.is_file():
         names = ", ".join(shipped_robots())
         raise FileNotFoundError(f"robot: found {robot!r}, expected {names} or the path of a robot.yaml")
     fields = read_document(file, "a YAML file of a robot", SCHEMA)
+    if undecided := [name for name, value in fields.items() if value == UNDECIDED]:
+        raise ValueError(f"{file}: {', '.join(undecided)}: found {UNDECIDED!r}, expected your numbers")
     links = read_links(file.parent / "robot.urdf")
     return structure_record(Robot, {**fields, "links": links, "folder": str(file.parent)}, file)
 
@@ -107,9 +103,14 @@ def _per_joint(value: Any) -> Any:
     return to_array(len(JOINT_NAMES), value)
 
 
-def _joints(description: str) -> Any:
+def _joints(description: str, default: Any = attrs.NOTHING) -> Any:
     """Declare a field with a number for each joint."""
-    return attrs.field(converter=_per_joint, validator=_check_joints, metadata={"description": description})
+    return attrs.field(
+        default=default,
+        converter=_per_joint,
+        validator=_check_joints,
+        metadata={"description": description},
+    )
 
 
 def _check_joints(robot: object, attribute: attrs.Attribute[Any], value: Any) -> None:
@@ -173,13 +174,14 @@ class Drive:
     """How the robot's drives are reached.
 
     Attributes:
-        board: Protocol of the robot's board, `unitree_udp` or `unitree_dds`.
+        board: Protocol of the robot's board, `unitree_udp` or `unitree_dds`; `external`: software
+            outside this project publishes `low_state` and obeys `low_cmd`.
         no_state_hint: What to check if no state arrives.
         dropped_out_mode: Mode of a motor that the board has switched off; None: unknown.
     """
 
-    board: str = field("unitree_udp", one_of=("unitree_udp", "unitree_dds"))
-    no_state_hint: str
+    board: str = field("external", one_of=("external", "unitree_udp", "unitree_dds"))
+    no_state_hint: str = ""
     dropped_out_mode: int | None = None
 
 
@@ -194,14 +196,10 @@ class Robot:
         kp: Usual proportional gain, N m/rad.
         kd: Usual derivative gain, N m s/rad.
         nominal_q: Joint positions of the stance, (12,), rad.
-        nominal_height: Trunk above ground in the stance, m.
         lie_q: Joint positions lying, (12,), rad.
-        lie_height: Trunk above ground lying, m.
         suspended_height: Trunk above ground if the robot is held in the air, m.
         torque_limit: Largest torque, (12,), N m.
         velocity_limit: Speed at which the drive has no torque left, (12,), rad/s.
-        command_lower: Least joint target that the drives accept, (12,), rad.
-        command_upper: Largest joint target that the drives accept, (12,), rad.
         armature: Reflected rotor inertia, (12,), kg m^2.
         joint_friction: Coulomb friction, (12,), N m.
         joint_damping: Viscous friction, (12,), N m s/rad.
@@ -211,8 +209,12 @@ class Robot:
         joint_links: Links that a joint moves, 12.
         lower: Mechanical range, (12,), rad.
         upper: Mechanical range, (12,), rad.
+        command_lower: Least joint target that the drives accept, (12,), rad; the default is `lower`.
+        command_upper: Largest joint target that the drives accept, (12,), rad; the default is `upper`.
         mass: Mass of all links, kg.
         legs: Lengths of the legs.
+        nominal_height: Trunk above ground in the stance, m, to 0.1 mm.
+        lie_height: Trunk above ground lying, m, to 0.1 mm.
     """
 
     name: str
@@ -221,25 +223,25 @@ class Robot:
     kp: float = positive()
     kd: float = positive()
     nominal_q: Array = _joints("stance, rad")
-    nominal_height: float = positive()
     lie_q: Array = _joints("lying, rad")
-    lie_height: float = positive()
     suspended_height: float = positive()
     torque_limit: Array = _joints("N m")
     velocity_limit: Array = _joints("rad/s")
-    command_lower: Array = _joints("rad")
-    command_upper: Array = _joints("rad")
     armature: Array = _joints("kg m^2")
     joint_friction: Array = _joints("N m")
     joint_damping: Array = _joints("N m s/rad")
     foot_radius: float = positive()
-    drive: Drive
+    drive: Drive = Drive()
     links: tuple[Link, ...]
     joint_links: tuple[Link, ...] = attrs.field(init=False)
     lower: Array = attrs.field(init=False)
     upper: Array = attrs.field(init=False)
+    command_lower: Array = _joints("rad", attrs.Factory(lambda robot: robot.lower, takes_self=True))
+    command_upper: Array = _joints("rad", attrs.Factory(lambda robot: robot.upper, takes_self=True))
     mass: float = attrs.field(init=False)
     legs: LegGeometry = attrs.field(init=False)
+    nominal_height: float = attrs.field(init=False)
+    lie_height: float = attrs.field(init=False)
 
     @joint_links.default
     def _joint_links(self) -> tuple[Link, ...]:
@@ -261,6 +263,14 @@ class Robot:
     @legs.default
     def _legs(self) -> LegGeometry:
         return _leg_geometry(self)
+
+    @nominal_height.default
+    def _nominal_height(self) -> float:
+        return _height(self, self.nominal_q)
+
+    @lie_height.default
+    def _lie_height(self) -> float:
+        return _height(self, self.lie_q)
 
     def __attrs_post_init__(self) -> None:
         """Refuse postures out of range, and limits or postures that are not left-right symmetric."""
@@ -288,6 +298,22 @@ class Robot:
     def actuator_file(self) -> Path:
         """Actuator model of the simulation."""
         return self.folder / "actuator.yaml"
+
+    def require_board(self) -> str:
+        """Return the protocol of the robot's board.
+
+        Returns:
+            `unitree_udp` or `unitree_dds`.
+
+        Raises:
+            ValueError: The robot is driven by software outside this project.
+        """
+        if self.drive.board == "external":
+            raise ValueError(
+                f"{self.folder}/robot.yaml: drive.board: found 'external', expected unitree_udp or "
+                "unitree_dds; other robots are driven by their own software (--low-level external)"
+            )
+        return self.drive.board
 
     def combined_inertial(self, name: str) -> Inertial:
         """Compute the inertia of a moving link together with everything that is fixed to it.
@@ -337,3 +363,13 @@ def _leg_geometry(robot: Robot) -> LegGeometry:
         calf=calf,
         knees=to_array(None, np.sign(robot.nominal_q[2::3])),
     )
+
+
+def _height(robot: Robot, q: Array) -> float:
+    """Return the trunk above level ground, m, to 0.1 mm, if the feet of a posture (12,), rad, stand on it."""
+    # Foot centre below the trunk's origin: with the angles h, t, c of hip, thigh, calf,
+    # z = z_hip + lateral sin(h) - (l_thigh cos(t) + l_calf cos(t + c)) cos(h).
+    legs, (hip, thigh, calf) = robot.legs, q.reshape(len(LEGS), 3).T
+    length = legs.thigh * np.cos(thigh) + legs.calf * np.cos(thigh + calf)
+    feet = legs.hips[:, 2] + legs.lateral * np.sin(hip) - length * np.cos(hip)
+    return round(robot.foot_radius - float(feet.min()), 4)

@@ -9,6 +9,17 @@ DEFAULT_ROBOT = "aliengo"
 """Robot of commands, nodes and recipes that name none."""
 UNNAMED_ROBOT = "aliengo"
 """Robot of a file without a name; such files are older than the names."""
+ROBOTS = Path(__file__).parent / "robots"
+"""Folder of the folders of the shipped robots."""
+
+
+def shipped_robots() -> tuple[str, ...]:
+    """List the robots that ship with the package.
+
+    Returns:
+        Their names.
+    """
+    return tuple(sorted(file.parent.name for file in ROBOTS.glob("*/robot.yaml")))
 
 
 def shipped_file(folder: Path, robot: str, name: str) -> Path:

@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
+from .arrays import Array
 from .bounded_yaml import read_yaml
 from .quadruped import JOINT_NAMES
 from .urdf import ROOT
@@ -88,19 +89,21 @@ def _add_joint(
         ElementTree.SubElement(element, "limit", {"lower": lower, "upper": upper, **limits})
 
 
-def generate_urdf(folder: Path) -> str:
+def generate_urdf(mjcf: str, name: str, torque_limit: Array, velocity_limit: Array) -> str:
     """Generate the URDF of a robot: root link `base_link`, then the bodies of its MJCF.
 
     Args:
-        folder: Folder of the robot.
+        mjcf: Text of the MJCF.
+        name: Name of the robot.
+        torque_limit: Largest torques, (12,), N m.
+        velocity_limit: Largest speeds, (12,), rad/s.
 
     Returns:
         URDF text.
     """
-    numbers = read_yaml(folder / "robot.yaml", "a YAML file of a robot")
-    spec = mujoco.MjSpec.from_file(str(folder / "robot.xml"))
+    spec = mujoco.MjSpec.from_string(mjcf)
     model = spec.compile()
-    tree = Element("robot", name=numbers["name"])
+    tree = Element("robot", name=name)
     ElementTree.SubElement(tree, "link", name=ROOT)
     for body in spec.bodies[1:]:
         link = ElementTree.SubElement(tree, "link", name=body.name)
@@ -112,11 +115,8 @@ def generate_urdf(folder: Path) -> str:
         joint, limits = None, {}
         if moving:
             joint = moving[0]
-            effort, velocity = (
-                np.resize(numbers[name], len(JOINT_NAMES))[JOINT_NAMES.index(joint.name)]
-                for name in ("torque_limit", "velocity_limit")
-            )
-            limits = {"effort": _text(effort), "velocity": _text(velocity)}
+            i = JOINT_NAMES.index(joint.name)
+            limits = {"effort": _text(torque_limit[i]), "velocity": _text(velocity_limit[i])}
         root = parent == "world"
         origin = np.zeros(3) if root else body.pos
         _add_joint(tree, body.name, ROOT if root else parent, origin, joint, limits)
@@ -128,5 +128,19 @@ def generate_urdf(folder: Path) -> str:
     return ElementTree.tostring(tree, encoding="unicode", xml_declaration=True) + "\n"
 
 
+def generate_folder_urdf(folder: Path) -> str:
+    """Generate the URDF of a robot's folder, from `robot.xml` and `robot.yaml`.
+
+    Args:
+        folder: Folder of the robot.
+
+    Returns:
+        URDF text.
+    """
+    numbers = read_yaml(folder / "robot.yaml", "a YAML file of a robot")
+    limits = (np.resize(numbers[name], len(JOINT_NAMES)) for name in ("torque_limit", "velocity_limit"))
+    return generate_urdf((folder / "robot.xml").read_text(encoding="utf-8"), numbers["name"], *limits)
+
+
 if __name__ == "__main__":
-    (Path(sys.argv[1]) / "robot.urdf").write_text(generate_urdf(Path(sys.argv[1])), encoding="utf-8")
+    (Path(sys.argv[1]) / "robot.urdf").write_text(generate_folder_urdf(Path(sys.argv[1])), encoding="utf-8")

@@ -51,11 +51,12 @@ def open_link(settings: DriverParameters, on_state: Callable[[BoardState], None]
     Raises:
         LinkError: The connection cannot be opened.
         FileNotFoundError: There is no such robot.
+        ValueError: The robot has no board that is known here.
         CalibrationError: The calibration file cannot be used.
     """
     calibration = settings.load_calibration()
     robot = load_robot(settings.robot)
-    uses_dds = robot.drive.board == "unitree_dds"
+    uses_dds = robot.require_board() == "unitree_dds"
     packets: WireFormat = dds_wire if uses_dds else wire
     if settings.dry_run:
         dry_run = DryRun(robot, packets)

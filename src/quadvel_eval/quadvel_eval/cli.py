@@ -35,7 +35,8 @@ ClusterOption = Annotated[
 
 
 RobotOption = Annotated[
-    str, typer.Option("--robot", metavar="<name|file>", help="The robot: aliengo, go2 or a robot.yaml.")
+    str,
+    typer.Option("--robot", metavar="<name|file>", help="The robot: aliengo, go2 or the folder of a robot."),
 ]
 
 

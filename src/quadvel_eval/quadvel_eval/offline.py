@@ -233,7 +233,7 @@ def replay_command(
         str | None,
         typer.Option(
             metavar="<name|file>",
-            help="The robot: aliengo, go2 or a robot.yaml.",
+            help="The robot: aliengo, go2 or the folder of a robot.",
             show_default="as recorded",
         ),
     ] = None,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -40,7 +41,7 @@ def run_in_parallel(calls: Sequence[Call], cluster: str | None = None) -> Iterat
 def _process_pool() -> Iterator[Callable[..., Any]]:
     """Provide a function that submits a call to a process on one of the available cores."""
     context = multiprocessing.get_context("spawn")  # forking a process with threads is not safe
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, initializer=_restore_interrupt) as pool:
+    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, initializer=_start_worker) as pool:
         try:
             yield pool.submit
         except KeyboardInterrupt:
@@ -90,7 +91,7 @@ def _interrupts_blocked() -> Iterator[None]:
     """Block SIGINT until the end of the block, also in processes that start in it.
 
     Ctrl-C reaches the whole process group. A worker that receives it during its imports would
-    print a traceback. Workers unblock SIGINT in `_restore_interrupt`.
+    print a traceback. Workers unblock SIGINT in `_start_worker`.
     """
     resource_tracker.ensure_running()  # otherwise it starts with the workers and unblocks signals
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -103,7 +104,16 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
-def _restore_interrupt() -> None:
-    """Let SIGINT end this worker immediately and silently."""
+def _start_worker() -> None:
+    """Let SIGINT, and the death of the parent process, end this worker immediately and silently."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def _end_with_parent() -> None:
+    """Wait for the end of the parent process; a killed parent cannot end its workers itself."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

@@ -1,9 +1,10 @@
-"""Checks the file of a new quadruped, MJCF or URDF (`quadvel robot check`)."""
+"""Checks the file of a new quadruped, MJCF or URDF, and writes its folder (`quadvel robot check`)."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from tempfile import TemporaryDirectory
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -15,7 +16,9 @@ from quadvel_description.arrays import Array
 from quadvel_description.found_robot import FoundRobot, find_robot
 from quadvel_description.found_robot_checks import check_found_robot
 from quadvel_description.quadruped import JOINT_NAMES, KINDS, LEGS
-from quadvel_recordings.output import output_folder
+from quadvel_description.robot import UNDECIDED
+from quadvel_description.robot_folder import robot_files
+from quadvel_recordings.output import created_folder, output_folder
 
 from .report import write_figure
 
@@ -24,17 +27,21 @@ MOVE_RAD = 0.4
 """How far the picture moves each joint, rad."""
 
 
-def robot_command(
-    action: Annotated[Literal["check"], typer.Argument(help="What to do.")],
+def check_command(
     file: Annotated[Path, typer.Argument(help="The robot: MJCF or URDF.", show_default=False)],
     out: Annotated[
-        Path, typer.Option(metavar="<folder>", help="Folder for a picture of each joint, moved.")
+        Path, typer.Option(metavar="<folder>", help="Folder of the robot to write, for --robot.")
     ] = Path("out/robot"),
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace the files of this folder, your numbers included.")
+    ] = False,
 ) -> None:
-    """Check the MJCF or URDF of a new quadruped.
+    """Check the MJCF or URDF of a new quadruped, and write its folder.
 
     It matches the twelve joints to legs by place and chain, and prints order, signs, limits and what is
-    missing or not symmetric. A robot with an arm, wheels or another number of joints is refused.
+    missing or not symmetric. A robot with an arm, wheels or another number of joints is refused. The
+    folder has a robot.yaml to complete, and the robot in our names, order and signs, as MJCF and URDF;
+    a picture shows each joint, moved.
 
     \b
     For example:
@@ -42,22 +49,52 @@ def robot_command(
 
     \b
     Exit codes:
-      0  the legs fit; findings may be left
-      1  the legs or feet do not fit the stack's kinematics
-      2  refused: no quadruped with twelve joints, or a wrong argument or file
+      0  the folder is written; findings and numbers to decide may be left
+      1  the legs or feet do not fit the stack's kinematics; nothing is written
+      2  refused: no quadruped with twelve joints, a wrong argument or file, or the folder has a robot
     """
     output_folder(out)
+    if (numbers := out / "robot.yaml").exists() and not force:
+        raise FileExistsError(f"{numbers}: exists, expected none; --force replaces it")
     found = find_robot(file)
     findings = check_found_robot(found)
     console = Console(soft_wrap=True, highlight=False, markup=False)
     console.print(describe_joints(found))
     for finding in findings:
         console.print(f"{'wrong' if finding.fatal else 'note '} {finding.code:13} {finding.text}")
-    fits = not any(finding.fatal for finding in findings)
-    if fits:
-        write_figure(out / PICTURE, draw_joints(found))
-        console.print(f"written: {out / PICTURE}")
-    raise typer.Exit(0 if fits else 1)
+    if any(finding.fatal for finding in findings):
+        raise typer.Exit(1)
+    names = write_robot_folder(found, out)
+    console.print(f"written: {out} ({', '.join(names)})")
+    undecided = [line.partition(":")[0] for line in numbers.read_text().splitlines() if _is_undecided(line)]
+    if undecided:
+        console.print(f"to decide in {numbers}: {', '.join(undecided)}")
+
+
+def _is_undecided(line: str) -> bool:
+    """Return whether a line of robot.yaml waits for a number."""
+    return line.endswith(f": {UNDECIDED}")
+
+
+def write_robot_folder(found: FoundRobot, out: Path) -> tuple[str, ...]:
+    """Write the folder of a robot: all files or none. Other files in it are kept.
+
+    Args:
+        found: The robot, without a fatal finding.
+        out: The folder.
+
+    Returns:
+        Names of the files.
+    """
+    with created_folder(out), TemporaryDirectory(dir=out, prefix=".robot-") as folder:
+        drafts = Path(folder)
+        for name, text in robot_files(found).items():
+            (drafts / name).write_text(text, encoding="utf-8")
+        write_figure(drafts / PICTURE, draw_joints(found))
+        names = tuple(sorted(draft.name for draft in drafts.iterdir()))
+        for name in names:
+            (drafts / name).replace(out / name)
+    return names
 
 
 def describe_joints(found: FoundRobot) -> str:

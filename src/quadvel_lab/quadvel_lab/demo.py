@@ -27,21 +27,20 @@ from quadvel_nodes.number_text import number_text
 from quadvel_recordings.output import atomic_write, output_folder
 from quadvel_sim.world import SHIPPED_WORLDS
 
-from .follow_demo import follow
+from .follow_demo import LOCKSTEP_HINT, follow
 from .scripted_walk import ScriptedWalk
 
 WALK, FOLLOW, TOUR = "quadvel demo walk", "quadvel demo follow", "quadvel demo follow --tour"
 OPTION_SCOPES = {
-    **dict.fromkeys(("quick", "low_level", "loss", "jitter", "actuator", "lockstep", "video"), (WALK,)),
+    **dict.fromkeys(("quick", "low_level", "loss", "jitter", "actuator", "video"), (WALK,)),
     **dict.fromkeys(("world", "tour"), (FOLLOW, TOUR)),
     **dict.fromkeys(("metres", "seed"), (TOUR,)),
     "seconds": (FOLLOW,),
-    "view": (WALK, FOLLOW),
+    **dict.fromkeys(("lockstep", "view"), (WALK, FOLLOW)),
 }
 """Options that not every kind of demo has, and the kinds that have them."""
 DERIVED_FILES = ("summary.json", "demo.png", "loop.png", "demo.mp4")
 """Files made from the recording; those of an earlier run are deleted."""
-LOCKSTEP_HINT = "if this machine is slow or busy, use --lockstep: simulated time then waits for the nodes"
 
 
 def demo_command(
@@ -51,7 +50,7 @@ def demo_command(
         typer.Argument(help="A walk in all directions, or following a person through a world."),
     ] = "walk",
     robot: Annotated[
-        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or a robot.yaml.")
+        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or the folder of a robot.")
     ] = DEFAULT_ROBOT,
     out: Annotated[
         Path | None,
@@ -115,7 +114,7 @@ def demo_command(
                 TourSetup(robot=robot, world=world, path_length=metres, seed=seed), folder, console
             )
         else:
-            good = follow(folder, robot, world, seconds, view, console)
+            good = follow(folder, robot, world, seconds, lockstep, view, console)
         raise typer.Exit(0 if good else 1)
     stack = _stack(robot, low_level, loss, jitter, lockstep, actuator)
     check_stack(stack)

@@ -171,7 +171,7 @@ def excite_command(
         typer.Option(help="What serves low_state and low_cmd; external: a running robot."),
     ] = "sim",
     robot: Annotated[
-        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or a robot.yaml.")
+        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or the folder of a robot.")
     ] = DEFAULT_ROBOT,
     hung: Annotated[
         bool | None,

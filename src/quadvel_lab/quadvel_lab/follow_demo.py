@@ -1,7 +1,7 @@
 """`quadvel demo follow`: the robot follows a person through a simulated world.
 
-It runs in real time with one process per node. The tour of some kilometres runs in one process
-instead, as fast as the machine permits (`quadvel_eval.following.tour`).
+It runs with one process per node, in real time or in lockstep. The tour of some kilometres runs in
+one process instead, as fast as the machine permits (`quadvel_eval.following.tour`).
 """
 
 from __future__ import annotations
@@ -37,8 +37,9 @@ FOLLOW_TOPICS = {
 """Topics and types that a following run records in addition."""
 
 
+LOCKSTEP_HINT = "if this machine is slow or busy, use --lockstep: simulated time then waits for the nodes"
 MAX_WAIT_S = 120.0
-"""Time within which the robot has to start to follow."""
+"""Real time within which the robot has to start to follow."""
 
 
 class FollowedWalk(RecordedRun):
@@ -48,7 +49,7 @@ class FollowedWalk(RecordedRun):
         recording: The MCAP file to write.
         stack: The nodes and their parameters.
         laser: Position x, y of the laser on the robot, m.
-        seconds: Duration, s.
+        seconds: Duration, s, in the time of the nodes.
         view: Whether to add the operator page.
         console: Console for output and bar.
     """
@@ -63,26 +64,35 @@ class FollowedWalk(RecordedRun):
         console: Console,
     ) -> None:
 
-        place = dict(zip(("laser_x", "laser_y"), laser, strict=True))
+        place: dict[str, Any] = dict(zip(("laser_x", "laser_y"), laser, strict=True))
+        if stack.use_sim_time:
+            place["use_sim_time"] = True
         names = ("person_tracker", "follow_planner")
         followers = {
             name: process_command(name, ros_arguments(name, place, stack.parameters)) for name in names
         }
         super().__init__(
-            recording, {**stack.commands(view), **followers}, FOLLOW_TOPICS, False, console, seconds
+            recording,
+            {**stack.commands(view), **followers},
+            FOLLOW_TOPICS,
+            stack.use_sim_time,
+            console,
+            seconds,
         )
-        self._seconds, self._began = seconds, float("inf")
+        self._seconds = seconds
+        self._began = float("inf")  # on the clock of the nodes
         self._created, self._last_state = time.monotonic(), "no state of the follow planner"
 
     @override
     def listen(self, node: Any) -> None:
         from std_msgs.msg import String
 
+        self._clock = node.get_clock()
         node.create_subscription(String, "follow_planner/state", self._on_state, 10)
 
     @override
     def is_over(self, ended: Mapping[str, int]) -> bool:
-        return not ended and time.monotonic() - self._began > self._seconds
+        return not ended and self._now() - self._began > self._seconds
 
     @override
     def failure(self) -> str:
@@ -90,17 +100,23 @@ class FollowedWalk(RecordedRun):
             return ""
         return f"the robot did not start to follow within {MAX_WAIT_S:.0f} s; last: {self._last_state}"
 
+    def _now(self) -> float:
+        """Return the time of the nodes, s."""
+        return 1e-9 * float(self._clock.now().nanoseconds)
+
     def _on_state(self, message: Any) -> None:
         """Update the bar."""
         self._last_state = message.data
         state, words = message.data.split(": ", maxsplit=1)
         if state == "following" and self._began == float("inf"):
-            self._began = time.monotonic()
-        passed = max(time.monotonic() - self._began, 0.0)
+            self._began = self._now()
+        passed = max(self._now() - self._began, 0.0)
         self._bar.update(self._task, completed=passed, description=words[:24])
 
 
-def follow(folder: Path, robot: str, world: str, seconds: float, view: bool, console: Console) -> bool:
+def follow(
+    folder: Path, robot: str, world: str, seconds: float, lockstep: bool, view: bool, console: Console
+) -> bool:
     """Run, evaluate and write the results.
 
     Args:
@@ -108,13 +124,14 @@ def follow(folder: Path, robot: str, world: str, seconds: float, view: bool, con
         robot: Name of a shipped robot, or path of a robot.yaml.
         world: Name or file of the world.
         seconds: Duration, s.
+        lockstep: Whether simulated time waits for the controller, instead of real time.
         view: Whether to add the operator page.
         console: Console for the report.
 
     Returns:
         Whether the robot neither fell nor touched anything.
     """
-    stack, loaded = Stack(robot=robot, world=world), World.load(world)
+    stack, loaded = Stack(robot=robot, world=world, use_sim_time=lockstep), World.load(world)
     check_stack(stack)
     recorded = folder / "follow.mcap"
     x, y, _ = loaded.laser.position.tolist()
@@ -126,4 +143,7 @@ def follow(folder: Path, robot: str, world: str, seconds: float, view: bool, con
     console.print(tour_table(write_tour(folder, loaded, outcome, moments)))
     console.print(f"written to {folder}: follow.mcap, tour.json, tour.png")
     console.print(f"to watch the run: quadvel view {recorded}", highlight=False)
-    return not (problem or outcome.fell or outcome.touched)
+    good = not (problem or outcome.fell or outcome.touched)
+    if not (good or lockstep):
+        console.print(LOCKSTEP_HINT)
+    return good

@@ -10,7 +10,6 @@ from socket import socket, socketpair
 from threading import Event, Thread
 from types import FrameType
 from typing import Any, TypeVar
-from weakref import WeakKeyDictionary
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
@@ -72,7 +71,7 @@ def read_parameters(node: Node, config: type[Config]) -> Config:
         raise StartError(f"parameters: {error.args[0]}") from error
 
 
-_exit_requests: WeakKeyDictionary[Node, str] = WeakKeyDictionary()
+_exit_requests: dict[Node, str] = {}
 
 
 def request_exit(node: Node, error: str = "") -> None:
@@ -123,7 +122,7 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
         rclpy.try_shutdown()
         for number in STOP_SIGNALS:
             signal.signal(number, signal.SIG_IGN)  # while the interpreter ends
-    if error := _exit_requests.get(node, ""):
+    if error := _exit_requests.pop(node, ""):
         sys.exit(error)
 
 
@@ -167,7 +166,7 @@ def _serve(node: Node, signals: socket, waker: socket) -> None:
     listener = Thread(target=stop_at_signal, daemon=True)
     listener.start()
     try:
-        while rclpy.ok() and not stopped.is_set() and node not in _exit_requests:
+        while node.context.ok() and not stopped.is_set() and node not in _exit_requests:
             executor.spin_once(timeout_sec=MAX_SPIN_WAIT_S)
     finally:
         with suppress(BlockingIOError):  # the buffer is full of signals: the listener is already awake

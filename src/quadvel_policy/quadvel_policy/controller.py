@@ -36,7 +36,7 @@ from quadvel_nodes.scheduling import Scheduling
 from .control_loop import WATCH_PERIOD_S, ControlConfig, ControlLoop
 from .loop_stats import LoopSummary
 from .operator_log import OperatorLog
-from .policy_file import SHIPPED_POLICY, load_policy
+from .policy_file import SHIPPED_POLICY, chosen_policy
 from .received import planar_velocity
 from .supervisor import Supervisor
 from .tick_input import MotorStatus as Motors
@@ -57,7 +57,7 @@ class ControllerParameters:
     scheduling: Scheduling = Scheduling()
     control: ControlConfig = ControlConfig()
     robot: str = field(DEFAULT_ROBOT, "the robot: its name, or the path of a robot.yaml")
-    policy: str = field("", "ONNX file of the policy; empty: the one that is shipped")
+    policy: str = field("", "ONNX file of the policy; empty: the shipped one; none: only stand")
 
 
 class Controller(Node):
@@ -68,8 +68,9 @@ class Controller(Node):
         self._settings = read_parameters(self, ControllerParameters)
         robot = load_robot(self._settings.robot)
         self._robot_check = RobotCheck(self, robot)
-        policy = load_policy(robot, self._settings.policy or None)
-        policy.prepare()  # the first run is slow
+        policy = chosen_policy(robot, self._settings.policy)
+        if policy:
+            policy.prepare()  # the first run is slow
         self._supervisor = Supervisor(
             robot, policy, self._settings.control.supervisor, KalmanEstimator(robot)
         )

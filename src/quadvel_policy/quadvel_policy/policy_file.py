@@ -21,6 +21,8 @@ from .observation import JOINTS, RATE_HZ, REQUIRED_FIELDS, MetadataError, Policy
 
 _POLICIES = Path(__file__).parent / "policies"
 SHIPPED_POLICY = _POLICIES / "crl_eam.onnx"
+NO_POLICY = "none"
+"""Choice of a robot that only stands up, stands and lies down."""
 
 
 def shipped_policy(robot: Robot) -> Path:
@@ -59,6 +61,22 @@ def load_policy(robot: Robot, path: str | Path | None = None) -> PolicyFile | Im
     return PolicyFile(robot, path)
 
 
+def chosen_policy(robot: Robot, choice: str) -> PolicyFile | ImportedPolicy | None:
+    """Load the policy that a user chose.
+
+    Args:
+        robot: The robot that the policy has to belong to.
+        choice: The ONNX file, "" for the shipped one, or NO_POLICY.
+
+    Returns:
+        The policy; None for NO_POLICY.
+
+    Raises:
+        NetworkFileError: As `load_policy`.
+    """
+    return None if choice == NO_POLICY else load_policy(robot, choice or None)
+
+
 class PolicyFile:
     """A recurrent policy: inputs `obs, h_in, c_in`, outputs `actions, h_out, c_out`, and metadata.
 
@@ -77,8 +95,16 @@ class PolicyFile:
             NetworkFileError: The file is missing or is not a policy for this robot and rate; one
                 sentence with the name of the file.
         """
-        path = shipped_policy(robot) if path is None else path
-        network = RecurrentNetwork(path, robot.name, {"actions": JOINTS}, REQUIRED_FIELDS)
+        path = shipped_policy(robot) if path is None else Path(path)
+        try:
+            network = RecurrentNetwork(path, robot.name, {"actions": JOINTS}, REQUIRED_FIELDS)
+        except NetworkFileError:
+            if IMPORTED_KEY not in metadata_texts(read_network(path)):
+                raise
+            raise NetworkFileError(
+                f"{path}: found a policy of another project ({IMPORTED_KEY}), expected one of this project: "
+                "imported policies run with up and eval"
+            ) from None
         try:
             self.metadata = PolicyMetadata.from_fields(network.metadata)
         except MetadataError as error:

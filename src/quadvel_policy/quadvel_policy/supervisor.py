@@ -25,6 +25,7 @@ from .guards import GUARDS
 from .guards.trunk import AccelerometerImplausible
 from .guards.velocity import EstimateStale, EstimateWrong
 from .modes import Damping, Mode, ModeInput, Policy, Posture, Walk
+from .observation import VelocityCommandLimits
 from .tick_input import TickInput
 from .transitions import (
     DAMPED_MODES,
@@ -35,6 +36,7 @@ from .transitions import (
     walk_refusal,
 )
 
+NO_VELOCITY = VelocityCommandLimits((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 STANCE_COMMAND = np.array([0.0, 0.0, 0.0, 1.0])
 VELOCITY_DECAY_S = 0.2
 """Decay time of the last known velocity while the robot brakes without an estimate."""
@@ -92,7 +94,7 @@ class Supervisor:
     def __init__(
         self,
         robot: Robot,
-        policy: Policy,
+        policy: Policy | None,
         config: SupervisorConfig | None = None,
         backup: Estimator | None = None,
         guards: Iterable[type[Guard]] = GUARDS,
@@ -101,7 +103,7 @@ class Supervisor:
 
         Args:
             robot: The robot.
-            policy: The policy that walks.
+            policy: The policy that walks; None: the robot stands up, stands and lies down only.
             config: Gains, durations and limits; None for the defaults.
             backup: Filter that replaces a missing or wrong velocity estimate; None for none.
             guards: Guard classes, in priority order.
@@ -112,19 +114,19 @@ class Supervisor:
         self._config = c = config or SupervisorConfig()
         c.check(robot)
         self._robot, self._bounds = robot, c.guards.joint_bounds(robot)
-        self._command_limits = policy.metadata.limits
-        nominal = np.array(policy.metadata.nominal_q)
+        self._command_limits = NO_VELOCITY if policy is None else policy.metadata.limits
+        nominal = robot.nominal_q if policy is None else np.array(policy.metadata.nominal_q)
         paths = {
             "stand_up": [(c.fold_time, robot.lie_q), (c.rise_time, nominal)],
             "stance": [(c.settle_time, nominal)],
             "lie_down": [(c.lie_down_time, robot.lie_q)],
         }
         self._postures = {mode: Posture(robot, path, c.stand_kp, c.stand_kd) for mode, path in paths.items()}
-        self._walk, damping = Walk(policy, c.blend_time), Damping(c.damping_kd)
-        self._modes: dict[str, Mode] = {
-            **self._postures, "passive": damping, "walk": self._walk, "fault": damping
-        }  # fmt: skip
-        self._situation = Situation(c, self._postures["stance"], c.auto_stand)
+        self._walk, damping = policy and Walk(policy, c.blend_time), Damping(c.damping_kd)
+        self._modes: dict[str, Mode] = {**self._postures, "passive": damping, "fault": damping}
+        if self._walk:
+            self._modes["walk"] = self._walk
+        self._situation = Situation(c, self._postures["stance"], c.auto_stand, has_policy=policy is not None)
         self._guards, self._backup = GuardSet(guards), BackupVelocity(backup)
         self._deferred_input: GuardInput | None = None  # of the last tick, until the deferred guards have run
         self._limiter = JointCommandLimiter(robot, c.joint_limits)
@@ -229,7 +231,7 @@ class Supervisor:
             self.command[3] = 0.0
         elapsed = 0.0 if self._entered_at is None else state.time - self._entered_at
         mode_input = ModeInput(elapsed, state, velocity, self.command, self._previous_answer)
-        if self._config.reset_gap < guard_input.gap <= self._config.guards.silence_limit:
+        if self._walk and self._config.reset_gap < guard_input.gap <= self._config.guards.silence_limit:
             self._walk.reset()
         self._follow_table(mode_input)
         answer = self._run_mode(mode_input, guard_input)
@@ -239,7 +241,7 @@ class Supervisor:
 
     def prepare(self) -> None:
         """Do work ahead of the next tick, so that its answer takes less time; optional."""
-        if self.mode == "walk":
+        if self._walk and self.mode == "walk":
             self._walk.prepare()
         self._run_deferred()
 
@@ -333,7 +335,7 @@ class Supervisor:
         except FloatingPointError as error:
             self.fail(str(error), "policy_not_finite")
             return JointCommand.damping(self._config.damping_kd)
-        if self.mode == "walk":
+        if self._walk and self.mode == "walk":
             self.inference_seconds = self._walk.inference_seconds
         self._limiter.apply(answer, guard_input.commanded_torque, mode_input.state)
         return answer
@@ -369,7 +371,8 @@ class Supervisor:
             now.walking_enabled = False
             now.latch.open()
             self.fault = fault
-            self._walk.reset()
+            if self._walk:
+                self._walk.reset()
 
 
 def _command_finding(fault: str, inputs: TickInput) -> Finding:

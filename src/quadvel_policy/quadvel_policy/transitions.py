@@ -37,6 +37,7 @@ class Situation:
         config: Limits.
         stance: The posture of stance.
         auto_stand: Whether the robot still has to stand up by itself.
+        has_policy: Whether there is a policy to walk with.
         mode: Present mode, one of MODES.
         reason: Why the robot is in this mode, one sentence.
         latch: The latched stop.
@@ -52,6 +53,7 @@ class Situation:
     config: SupervisorConfig
     stance: Posture
     auto_stand: bool
+    has_policy: bool = True
     mode: str = "passive"
     reason: str = "waiting for a mode request"
     latch: StopLatch = attrs.Factory(StopLatch)
@@ -71,8 +73,8 @@ class Situation:
 
     @property
     def is_walking_allowed(self) -> bool:
-        """Whether the operator allows walking, or need not."""
-        return self.walking_enabled or not self.config.require_operator
+        """Whether there is a policy, and the operator allows walking, or need not."""
+        return self.has_policy and (self.walking_enabled or not self.config.require_operator)
 
     @property
     def speed(self) -> float:
@@ -136,6 +138,11 @@ def _require_stop(now: Situation) -> str:
     return "" if now.latch.cause else "no fault stopped the robot"
 
 
+def _require_policy(now: Situation) -> str:
+    """There is a policy."""
+    return "" if now.has_policy else "there is no policy to walk with"
+
+
 def _require_permission_to_walk(now: Situation) -> str:
     """Walking is allowed."""
     return "" if now.is_walking_allowed else "walking is not allowed yet: call ~/enable_walking"
@@ -183,7 +190,12 @@ REQUESTED: dict[tuple[str, str], tuple[Precondition, ...]] = {
     ("lie_down", "stand_up"): (),
     ("passive", "stance"): (_require_nominal_posture,),
     ("walk", "stance"): (_require_commanded_stand,),
-    ("stance", "walk"): (_require_no_stop, _require_permission_to_walk, _require_known_velocity),
+    ("stance", "walk"): (
+        _require_policy,
+        _require_no_stop,
+        _require_permission_to_walk,
+        _require_known_velocity,
+    ),
     ("stand_up", "lie_down"): (),
     ("stance", "lie_down"): (),
     ("walk", "lie_down"): (_require_commanded_stand,),
@@ -205,7 +217,7 @@ AUTOMATIC: dict[tuple[str, str], Automatic] = {
     # The supervisor replaces a velocity by "stand" until a zero command was seen with walking allowed
     # and no stop latched.
     ("stance", "walk"): Automatic(
-        (_require_commanded_velocity, _require_known_velocity, _require_ended_path),
+        (_require_policy, _require_commanded_velocity, _require_known_velocity, _require_ended_path),
         lambda now: "a velocity was commanded",
     ),
     ("walk", "stance"): Automatic((_require_stop, _require_braked), lambda now: now.latch.sentence),
@@ -274,7 +286,9 @@ def walk_refusal(now: Situation) -> str:
         return "the robot is in fault: request passive, then stand_up"
     if now.mode not in VELOCITY_MODES:
         return f"the robot is in mode {now.mode}, expected {' or '.join(VELOCITY_MODES)}"
-    return _first_refusal((_require_no_stop, _require_permission_to_walk, _require_zero_command_seen), now)
+    return _first_refusal(
+        (_require_policy, _require_no_stop, _require_permission_to_walk, _require_zero_command_seen), now
+    )
 
 
 def _first_refusal(preconditions: Iterable[Precondition], now: Situation) -> str:

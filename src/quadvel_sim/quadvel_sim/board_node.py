@@ -76,9 +76,9 @@ def make_board(settings: BoardParameters) -> Board:
         The board, without a simulation.
 
     Raises:
-        ValueError: The address cannot be used.
+        ValueError: The address cannot be used, or the robot has no board that is known here.
     """
-    if load_robot(settings.robot).drive.board == "unitree_dds":
+    if load_robot(settings.robot).require_board() == "unitree_dds":
         return DdsBoard(Bus(settings.dds_domain, settings.interface), settings, settings.calibration())
     return UdpBoard((settings.address, settings.port), settings, settings.calibration())
 

@@ -253,7 +253,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         level, summary = self._level_and_summary(report, warning)
         values = {
             "mode": self._loop.mode,
-            "actuator": self._settings.actuator_file or "the shipped AlienGo (Table 4)",
+            "actuator": self._settings.actuator_file or "the robot's own",
             "realtime_factor": f"{report.realtime_factor:.3f}",
             "worst_lateness_ms": f"{1e3 * report.worst_lateness:.2f}",
             "given_up_s": f"{report.given_up:.3f}",

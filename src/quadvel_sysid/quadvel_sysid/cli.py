@@ -123,7 +123,7 @@ def identify(
         str | None,
         typer.Option(
             metavar="<name|file>",
-            help="The robot, aliengo, go2 or a robot.yaml, or an MJCF or URDF file; its legs replay the commands before and after.",
+            help="The robot, aliengo, go2 or its folder, or an MJCF or URDF file; its legs replay the commands before and after.",
             show_default="no replay",
         ),
     ] = None,

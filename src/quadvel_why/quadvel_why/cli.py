@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from quadvel_policy.policy_file import PolicyFile
+from quadvel_policy.imported.policy import ImportedPolicy
+from quadvel_policy.policy_file import chosen_policy
 from quadvel_recordings.output import atomic_write, output_folder
 
 from .diagnosis import diagnose
@@ -32,7 +33,7 @@ def why_command(
         Path | None,
         typer.Option(
             metavar="<file>",
-            help="ONNX file of the policy that drove.",
+            help="ONNX file of the policy that drove, or none.",
             show_default="the shipped one, for a recording of this stack",
         ),
     ] = None,
@@ -40,7 +41,7 @@ def why_command(
         str | None,
         typer.Option(
             metavar="<name|file>",
-            help="The robot: aliengo, go2 or a robot.yaml.",
+            help="The robot: aliengo, go2 or the folder of a robot.",
             show_default="as recorded, or aliengo",
         ),
     ] = None,
@@ -77,9 +78,15 @@ def why_command(
     """
     output_folder(out)
     run = read_run(recording, gains, robot)
-    driver = PolicyFile(run.robot, policy) if policy is not None or run.is_own else None
+    driver = chosen_policy(run.robot, str(policy or "")) if policy is not None or run.is_own else None
     for remark in run.remarks:
         typer.echo(f"quadvel: warning: {recording}: {remark}", err=True)
+    if isinstance(driver, ImportedPolicy):
+        typer.echo(
+            f"quadvel: warning: {policy}: is of another project, so it is not replayed on the recording",
+            err=True,
+        )
+        driver = None
     diagnosis = diagnose(Signals(run, driver))
     typer.echo(summary(run, diagnosis))
     with atomic_write(out / "why.json") as draft:

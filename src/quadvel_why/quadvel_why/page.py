@@ -40,6 +40,8 @@ are named, with the experiment that distinguishes them.
 
 A recording of this stack holds everything. Of another robot's `LowState` and `LowCmd`, or of a table,
 only the causes are examined that need no kinematics and no policy; the answer lists the others.
+A policy of another project (`quadvel policy import`) is not replayed; `--policy none` asks without
+one.
 
 ## How a cause is found
 

@@ -37,4 +37,4 @@ class Clock(Partial):
     def _now_ns(self) -> int:
         if self._simulated_ns is not None:
             return self._simulated_ns
-        return time.monotonic_ns() if self.clock_type == ClockType.STEADY_TIME else time.time_ns()
+        return time.monotonic_ns() if self.clock_type is ClockType.STEADY_TIME else time.time_ns()

@@ -135,7 +135,8 @@ def get_default_context(*, shutting_down: bool = False) -> Context:
 
 @atexit.register
 def _leave_all() -> None:
-    """Leave the domain when the process exits."""
+    """Leave the domain when the process exits, while Cyclone's threads can still call Python."""
     for context in list(_contexts):
         context.try_shutdown()
         context._leave(unless_used=False)
+    wire.leave_domains()

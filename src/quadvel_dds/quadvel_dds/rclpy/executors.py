@@ -52,9 +52,10 @@ class Executor(Partial):
         self._ready: deque[Any] = deque()  # entities that had data or were due after the last wait
         self._lock = RLock()
         self._waitset: wire.WaitSet | None = None
-        # What the wait set waits for, looked up again once something changed.
+        # What is waited for, looked up again once something changed: timers that run, and the other
+        # entities with their ranks by their readers.
         self._timers: list[Timer] = []
-        self._waiting: list[Any] = []
+        self._ranked: dict[wire.Reader, tuple[int, Any]] = {}
         self._has_changed = True
         self._is_shutdown = False
         self.context._wakers.add(self)
@@ -146,7 +147,7 @@ class Executor(Partial):
         Args:
             timeout_sec: Longest wait for a callback, s; None or negative: unlimited.
         """
-        self._spin_once(_deadline(timeout_sec), lambda: False)
+        self._spin_once(_deadline(timeout_sec), _never)
 
     def spin_until_future_complete(self, future: Future, timeout_sec: float | None = None) -> None:
         """Run callbacks until a future is done, the timeout, or a shutdown.
@@ -185,32 +186,42 @@ class Executor(Partial):
 
     def _wait(self, deadline_ns: int) -> None:
         """Wait for a ready entity, the deadline or `wake`; ready entities go into `_ready`."""
-        with self._lock:
-            if self._is_shutdown:
-                return
-            if self._waitset is None:
-                self._waitset = wire.WaitSet(self.context.participant)
-            waitset = self._waitset
-            if self._has_changed:
-                self._has_changed = False
-                entities = [entity for node in self._nodes for entity in node._entities()]
-                self._timers = [entity for entity in entities if isinstance(entity, Timer)]
-                self._waiting = [entity for entity in entities if not isinstance(entity, Timer)]
-                waitset.update({entity._reader for entity in self._waiting})
-            timers, waiting = self._timers, self._waiting
-        if not self.context.ok():  # a signal may have come before the wait set existed
+        if self._has_changed:
+            self._look_up_entities()
+        waitset = self._waitset
+        if waitset is None or not self.context.ok():  # a signal may have come before it existed
             return
-        wakes = [(wake, timer) for timer in timers if (wake := timer._wake_ns()) is not None]
+        wakes = [(wake, timer) for timer in self._timers if (wake := timer._wake_ns()) is not None]
         wake_ns = min([deadline_ns, *(wake for wake, _ in wakes)])
         found = waitset.wait(min(max(0, wake_ns - time.monotonic_ns()), MAX_WAIT_NS))
         now = time.monotonic_ns()
         self._ready.extend(timer for wake, timer in wakes if wake <= now)
         if found:
-            self._ready.extend(entity for entity in waiting if entity._reader in found)
+            ranked = sorted(self._ranked[reader] for reader in found if reader in self._ranked)
+            self._ready.extend(entity for _, entity in ranked)
+
+    def _look_up_entities(self) -> None:
+        """Attach the present entities of all nodes to the wait set; do nothing after a shutdown."""
+        with self._lock:
+            if self._is_shutdown:
+                return
+            self._has_changed = False
+            if self._waitset is None:
+                self._waitset = wire.WaitSet(self.context.participant)
+            entities = [entity for node in self._nodes for entity in node._entities()]
+            self._timers = [one for one in entities if isinstance(one, Timer) and not one._canceled]
+            waiting = [entity for entity in entities if not isinstance(entity, Timer)]
+            self._ranked = {entity._reader: (rank, entity) for rank, entity in enumerate(waiting)}
+            self._waitset.update(set(self._ranked))
 
 
 class SingleThreadedExecutor(Executor):
     """Executor that runs callbacks in the spinning thread, as every executor here does."""
+
+
+def _never() -> bool:
+    """Return False: the condition of a spin that has none."""
+    return False
 
 
 def _deadline(timeout_sec: float | None) -> int:

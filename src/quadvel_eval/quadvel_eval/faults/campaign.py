@@ -92,8 +92,10 @@ def run_campaign(
         The runs, case by case.
 
     Raises:
-        ValueError: No case contains `only`.
+        FileNotFoundError: There is no such robot, or it has no policy.
+        ValueError: The robot's file is not valid, or no case contains `only`.
     """
+    _networks(load_robot(robot))  # fail on a bad robot here, once, before any run
     cases = [case for case in CASES if only is None or only in case.name]
     if not cases:
         words = [dict.fromkeys(case.name.split()[i] for case in CASES) for i in range(3)]

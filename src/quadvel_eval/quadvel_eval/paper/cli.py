@@ -65,6 +65,8 @@ def paper_command(
     """
     policies = _policies(policy or [])
     chosen = load_robot(robot)
+    for path in policies.values():
+        PolicyFile(chosen, path)  # fail on a bad file here, once, before any run
     study = Study(
         robot=robot,
         **({"policies": policies} if policies else {}),
@@ -72,8 +74,6 @@ def paper_command(
         estimator_file=estimator_file or shipped_estimator(chosen),
         seeds=seeds,
     )
-    for path in study.policies.values():
-        PolicyFile(chosen, path)  # fail on a bad file here, once, before any run
     LearnedEstimator(chosen, study.estimator_file)
     sections = _sections(only or [])
     folder = output_folder(out)

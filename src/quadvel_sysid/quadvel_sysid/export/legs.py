@@ -26,7 +26,8 @@ from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf
 from quadvel_description.arrays import Array, Bools
-from quadvel_description.robot import is_robot, load_robot, shipped_robots
+from quadvel_description.robot import is_robot, load_robot
+from quadvel_description.robot_name import shipped_robots
 
 from ..data.log_signals import as_double
 from ..logs.log import Log, LogError
