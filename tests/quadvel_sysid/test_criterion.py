@@ -59,21 +59,6 @@ def test_a_disturbance_of_all_joints_counts_once() -> None:
     assert significant <= 12
 
 
-def test_two_models_of_equal_error_differ_significantly_only_by_chance() -> None:
-    """Each model has an error of its own: 1 % of equal ones differ at the 1 % level, worse ones do."""
-    rng, rows = np.random.default_rng(0), np.ones((2000, 3), dtype=bool)
-    parts = DataSplit(rows, rows, rows, np.arange(0, 2000, 40))
-    noise = rng.normal(size=(200, 2000, 3))
-    own = [np.repeat(rng.normal(size=(200, 50, 3)), 40, axis=1) for _ in range(2)]
-
-    def p_value(k: int, size: float) -> float:
-        before, after = noise[k] + size * own[0][k], noise[k] + 0.3 * own[1][k]
-        return compare_residuals(parts, before, after, rows).non_nested_p_value
-
-    assert np.sum([p_value(k, 0.3) < SIGNIFICANCE_LEVEL for k in range(200)]) <= 6
-    assert np.median([p_value(k, 0.6) for k in range(20)]) < SIGNIFICANCE_LEVEL
-
-
 def test_quantised_torque_has_rounding_noise_and_constant_torque_the_noise_of_other_joints() -> None:
     log = record(parameters(), joints=3, seconds=2.0)
     tau = log.tau.copy()

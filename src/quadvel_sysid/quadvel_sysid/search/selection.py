@@ -129,7 +129,7 @@ class Search:
         effects = self.extend(effects, EFFECTS, record, most=2, bound=regressors.criterion)
         if not effects.is_white:
             regressors = self.extend(regressors, REGRESSORS, record)
-        # Among equivalent models the one with the fewest regressors counts.
+        # Among models with nearly equal criteria the one with the fewest regressors counts.
         models, bound = [regressors], regressors.criterion
         margin = EQUIVALENCE_MARGIN * len(self.evaluator.noise)
         if effects.is_white or not regressors.is_white or effects.criterion < bound + margin:
@@ -137,13 +137,8 @@ class Search:
             models.append(effects)
             if not effects.is_white:
                 models.append(self.extend(effects, REGRESSORS, record, bound=bound))
-        least = min(models, key=lambda one: one.criterion)
-        equivalent = [
-            one
-            for one in models
-            if one.criterion < least.criterion + margin
-            or least.compare_with(one).non_nested_p_value > SIGNIFICANCE_LEVEL
-        ]
+        least = min(one.criterion for one in models)
+        equivalent = [one for one in models if one.criterion < least + margin]
         key = _regressor_count if self._options.effects_before_regressors else _criterion
         return SearchResult(self.prune(min(equivalent, key=key)), effects, record)
 

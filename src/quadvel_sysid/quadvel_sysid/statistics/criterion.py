@@ -73,20 +73,6 @@ class Comparison:
         )
         return float(min(_score_test(*sums)[0], self.joint_p_values.min() * self.rows.shape[1]))
 
-    @property
-    def non_nested_p_value(self) -> float:
-        """One-sided p-value of the error's reduction between models of which none contains the other.
-
-        Reference: Q. H. Vuong, Likelihood ratio tests for model selection and non-nested hypotheses,
-        1989.
-        """
-        # With the mean squared error s_j^2 of joint j before, the log-likelihood of cluster c rises by
-        #     d_c = sum_j sum over c of (e0^2 - e1^2) / (2 s_j^2).
-        # A t test shows whether the mean of d_c is above 0.
-        before = (self.error_reduction + self.error_after).sum(axis=0) / np.maximum(self.rows.sum(axis=0), 1)
-        d = np.sum(self.error_reduction / np.maximum(2.0 * before, 1e-300), axis=1)[self.rows.any(axis=1)]
-        return float(stats.ttest_1samp(d, 0.0, alternative="greater").pvalue) if len(d) > 1 else 1.0
-
 
 _MIN_CLUSTERS = 4
 """Minimum number of clusters: with fewer the variance of the score is unknown."""
