@@ -23,7 +23,7 @@ QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; mai
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("follow")
-    options = ["--lockstep", "--world", "campus", "--seconds", "10", "--out", str(out)]
+    options = ["--lockstep", "--world", "campus", "--seconds", "5", "--out", str(out)]
     ended = subprocess.run(
         [*QUADVEL, "demo", "follow", *options], capture_output=True, text=True, timeout=300
     )

@@ -33,6 +33,7 @@ ALTERNATIONS = 6  # equal offsets of four hips resemble a tilted IMU, so the fit
 TORQUE_NOISE_NM = 0.25  # standard deviation of a measured torque
 ZERO_PRIOR_RAD = 0.035  # (2 deg), prior standard deviation of an encoder zero
 TORQUE_SCALE_PRIOR = 0.1  # prior standard deviation of the scale of measured torques
+ZERO_STEP_RAD = 1e-6  # step of differences by encoder zeros
 REVERSAL_MARGIN = 30  # states around a reversal to leave out: the joint accelerates there
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -190,13 +191,7 @@ def _joint_zeros(robot: Robot, suspended: Samples, calibration: Calibration) -> 
 def _leg_zeros(robot: Robot, suspended: Samples, down: Array, leg: int, start: Array) -> tuple[Array, Array]:
     """Return zeros and standard errors of one leg, (3,) rad each.
 
-    Least squares over the zeros z, torque scales k, Coulomb friction c and viscous friction d of
-    three joints:
-
-        tau = k tau_hold(q - z) + c sign(dq) + d dq
-
-    weighted by TORQUE_NOISE_NM, with priors k = 1 +- TORQUE_SCALE_PRIOR and z = 0 +-
-    ZERO_PRIOR_RAD. The covariance is s^2 (J^T J)^-1 with the residual variance s^2, at least 1.
+    The covariance of the fit is s^2 (J^T J)^-1 with the residual variance s^2, at least 1.
 
     Args:
         robot: The robot.
@@ -208,32 +203,71 @@ def _leg_zeros(robot: Robot, suspended: Samples, down: Array, leg: int, start: A
     joints = slice(3 * leg, 3 * leg + 3)
     steady = np.flatnonzero(_is_steady(suspended.dq[:, joints]))
     rows = steady[:: max(1, len(steady) // MAX_ROWS)]
-    q, dq, tau, down = (
-        suspended.q[rows, joints],
-        suspended.dq[rows, joints],
-        suspended.tau[rows, joints],
-        down[rows],
+    problem = _LegProblem(
+        robot,
+        leg,
+        q=suspended.q[rows, joints],
+        dq=suspended.dq[rows, joints],
+        tau=suspended.tau[rows, joints],
+        down=down[rows],
     )
-
-    def residuals(x: Array) -> Array:
-        """Return the weighted residuals for zeros, torque scales, Coulomb and viscous friction, (3,) each."""
-        zeros, scale, dry, viscous = x.reshape(4, 3)
-        model = scale * _leg_torque(robot, q - zeros, down, leg) + dry * np.sign(dq) + viscous * dq
-        return np.concatenate(
-            [
-                ((tau - model) / TORQUE_NOISE_NM).ravel(),
-                (scale - 1.0) / TORQUE_SCALE_PRIOR,
-                zeros / ZERO_PRIOR_RAD,
-            ]
-        )
-
     guess = np.concatenate(
         [start[joints], np.ones(3), robot.joint_friction[joints], robot.joint_damping[joints]]
     )
-    fit = least_squares(residuals, guess, x_scale=np.repeat([0.1, 0.1, 0.5, 0.5], 3))
+    scale = np.repeat([0.1, 0.1, 0.5, 0.5], 3)
+    fit = least_squares(problem.residuals, guess, problem.jacobian, x_scale=scale)
     variance = np.square(fit.fun[:-6]).sum() / (fit.fun.size - 6 - fit.x.size)
     errors = np.sqrt(max(variance, 1.0) * np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
     return fit.x[:3], errors[:3]
+
+
+@attrs.frozen(eq=False)
+class _LegProblem:
+    """Least squares over the zeros z, torque scales k, Coulomb friction c and viscous friction d of a leg.
+
+        tau = k tau_hold(q - z) + c sign(dq) + d dq
+
+    It is weighted by TORQUE_NOISE_NM, with priors k = 1 +- TORQUE_SCALE_PRIOR and z = 0 +-
+    ZERO_PRIOR_RAD. The parameters are (z, k, c, d) of the three joints, (12,).
+
+    Attributes:
+        robot: The robot.
+        leg: Index of the leg.
+        q: Joint angles, (n, 3), rad.
+        dq: Joint speeds, (n, 3), rad/s.
+        tau: Joint torques, (n, 3), N m.
+        down: Direction of gravity in the trunk frame, (n, 3).
+    """
+
+    robot: Robot
+    leg: int
+    q: Array
+    dq: Array
+    tau: Array
+    down: Array
+
+    def residuals(self, x: Array) -> Array:
+        """Return the weighted residuals of the torques and of the priors of k and z, (3 n + 6,)."""
+        zeros, scale, dry, viscous = x.reshape(4, 3)
+        model = scale * self._holding(zeros) + dry * np.sign(self.dq) + viscous * self.dq
+        priors = (scale - 1.0) / TORQUE_SCALE_PRIOR, zeros / ZERO_PRIOR_RAD
+        return np.concatenate([((self.tau - model) / TORQUE_NOISE_NM).ravel(), *priors])
+
+    def jacobian(self, x: Array) -> Array:
+        """Return the derivatives of the residuals, (3 n + 6, 12); those by z from differences."""
+        zeros, scale, _, _ = x.reshape(4, 3)
+        model = np.zeros((len(self.q), 3, 4, 3))  # d tau_joint / d (kind of parameter, of joint)
+        holding, own = self._holding(zeros), np.arange(3)
+        for joint, step in enumerate(ZERO_STEP_RAD * np.eye(3)):
+            model[:, :, 0, joint] = scale * (self._holding(zeros + step) - holding) / ZERO_STEP_RAD
+        for kind, slope in enumerate((holding, np.sign(self.dq), self.dq), 1):
+            model[:, own, kind, own] = slope
+        priors = np.zeros((2, 3, 4, 3))
+        priors[0, own, 1, own], priors[1, own, 0, own] = 1.0 / TORQUE_SCALE_PRIOR, 1.0 / ZERO_PRIOR_RAD
+        return np.vstack([-model.reshape(-1, 12) / TORQUE_NOISE_NM, priors.reshape(-1, 12)])
+
+    def _holding(self, zeros: Array) -> Array:
+        return _leg_torque(self.robot, self.q - zeros, self.down, self.leg)
 
 
 def _is_steady(dq: Array) -> Bools:
