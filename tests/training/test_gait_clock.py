@@ -169,3 +169,12 @@ def test_the_scripted_trot_alone_runs():
         assert not env.fallen.any()
     assert (np.mean(velocity[100:], axis=0) > 0.75 * speeds).all()
     assert np.abs(np.mean(height[100:], axis=0) - 0.37).max() < 0.04
+
+
+def test_a_walk_that_starts_with_the_other_pair_is_half_a_cycle_apart() -> None:
+    clock = GaitClock(2)
+    clock.reset(np.arange(2), other_pair=np.array([False, True]))
+    command, none = np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)), np.zeros((2, 4), bool)
+    for _ in range(20):
+        clock.advance(command, np.zeros(2), none, 0.02)
+        np.testing.assert_allclose(clock.foot_phases()[1], clock.foot_phases()[0][[1, 0, 3, 2]])
