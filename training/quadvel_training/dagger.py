@@ -86,7 +86,7 @@ class DaggerConfig:
     mini_batches: int = 16
     learning_rate: float = 7e-4
     final_learning_rate: float = 7e-5
-    driven: float = 0.9
+    driven: float = 0.8
     first_driven: float = 0.2
     takeover: float = 2e6
     noise: float = 0.09
