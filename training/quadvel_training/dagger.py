@@ -238,13 +238,12 @@ class DaggerRun:
         if not len(ids):
             return
         self.env.reset(ids)
-        self.past.reset(ids)
         self.teacher.reset(ids)
         self.driven[ids] = self._turn[ids] < self._share()
         # The student starts with FR and RL. Half of the teacher's robots start with the other pair,
         # so that the student takes its phase from the motion, and walks mirrored as well.
         other_pair = ~self.driven[ids] & (self.env.rng.random(len(ids)) < 0.5)
-        self.past.clock.reset(ids, other_pair)
+        self.past.reset(ids, other_pair)
         self._previous[ids] = self._noise[ids] = 0.0
         self._memory = (self._memory[0].clone(), self._memory[1].clone())
         for memory in self._memory:

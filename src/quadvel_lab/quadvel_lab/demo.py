@@ -27,7 +27,8 @@ from quadvel_nodes.number_text import number_text
 from quadvel_recordings.output import atomic_write, output_folder
 from quadvel_sim.world import SHIPPED_WORLDS
 
-from .follow_demo import LOCKSTEP_HINT, follow
+from .follow_demo import follow
+from .recorded_run import LOCKSTEP_HINT
 from .scripted_walk import ScriptedWalk
 
 WALK, FOLLOW, TOUR = "quadvel demo walk", "quadvel demo follow", "quadvel demo follow --tour"

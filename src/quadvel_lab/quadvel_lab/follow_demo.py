@@ -22,7 +22,7 @@ from quadvel_eval.following.tour_report import tour_table, write_tour
 from quadvel_recordings.output import atomic_write
 from quadvel_sim.world import World
 
-from .recorded_run import RecordedRun
+from .recorded_run import LOCKSTEP_HINT, RecordedRun
 
 FOLLOW_TOPICS = {
     "/cmd_vel_follow": "geometry_msgs/msg/Twist",
@@ -37,7 +37,6 @@ FOLLOW_TOPICS = {
 """Topics and types that a following run records in addition."""
 
 
-LOCKSTEP_HINT = "if this machine is slow or busy, use --lockstep: simulated time then waits for the nodes"
 MAX_WAIT_S = 120.0
 """Real time within which the robot has to start to follow."""
 

@@ -38,6 +38,8 @@ RECORDED_TOPICS = {
     "/velocity_estimate": "geometry_msgs/msg/TwistWithCovarianceStamped",
 }
 """Topics and types that every run records; each run adds those of its planner."""
+LOCKSTEP_HINT = "if this machine is slow or busy, use --lockstep: simulated time then waits for the nodes"
+"""What to try if a run in real time failed."""
 POLL_PERIOD_S = 0.2
 """Time between two checks of the nodes."""
 
