@@ -1,7 +1,8 @@
 """Unitree's own Python client, unchanged, as a program: reads states, releases the controller, moves a joint.
 
 It has a process of its own because it opens the DDS domain by its number, which the embedded middleware may have
-opened. What it finds it prints, one JSON value a line. It goes on from one step to the next at a line on stdin.
+opened. What it finds it prints, one JSON value a line; what the vendor's library prints goes to stderr. It goes on
+from one step to the next at a line on stdin.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import json
 import sys
 import threading
 import time
+from contextlib import redirect_stdout
 from typing import Any
 
 from unitree_sdk2py.comm.motion_switcher.motion_switcher_client import MotionSwitcherClient
@@ -41,10 +43,15 @@ class Sender(threading.Thread):
 
 
 def show(value: Any) -> None:
-    print(json.dumps(value), flush=True)
+    print(json.dumps(value), file=sys.__stdout__, flush=True)
 
 
 def main(domain: str, interface: str, target: str, crc_error: str) -> None:
+    with redirect_stdout(sys.stderr):
+        drive(domain, interface, target, crc_error)
+
+
+def drive(domain: str, interface: str, target: str, crc_error: str) -> None:
     ChannelFactoryInitialize(int(domain), interface)
     states: list[Any] = []
     reader = ChannelSubscriber("rt/lowstate", LowState_)
