@@ -9,10 +9,12 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
 from quadvel_description import symmetry  # noqa: E402
+from quadvel_description.kinematics import foot_positions  # noqa: E402
 from quadvel_sim.terrain import Terrain  # noqa: E402
-from quadvel_training import loop, privileged, process_group  # noqa: E402
+from quadvel_training import loop, privileged, process_group, scripted_trot  # noqa: E402
 from quadvel_training.command_grid import CELL_WIDTH, INITIAL_REACH, CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import EnvConfig, VelocityEnv  # noqa: E402
+from quadvel_training.gait_clock import GaitClock  # noqa: E402
 from quadvel_training.privileged import (  # noqa: E402
     CommandScorer,
     NumberedCheckpoints,
@@ -126,10 +128,40 @@ def test_the_mirrored_robot_observes_the_mirror_image():
     env._update_state()
     past.advance(env.command)
     past.clock.phase[:] = [0.2, 0.7]  # mirrored steps come half a cycle later
-    trot = joint_offsets(env, past.clock)
+    past.lasting[:] = [[0.1, 0.05, 0.2], [0.1, -0.05, -0.2]]
+    trot = joint_offsets(env, past.clock, past.lasting[:, :2])
     assert trot[1] == pytest.approx(symmetry.JOINTS(trot[0]), abs=1e-4)
     one, other = privileged.observe(env, past, np.stack([joints, symmetry.JOINTS(joints)]))
     assert np.allclose(privileged.MIRROR(one), other, atol=1e-5)
+
+
+def walking_feet(env: VelocityEnv, planned: list[float], lasting: list[float]) -> np.ndarray:
+    """Feet (4, 3) of the scripted trot of a robot that moves as planned."""
+    clock = GaitClock(4)
+    clock.walking[:], clock.velocity[:] = True, planned
+    env.velocity[:, :2], env.angular_velocity[:] = planned[:2], [0.0, 0.0, planned[2]]
+    offsets = joint_offsets(env, clock, np.tile(lasting, (4, 1)))
+    return foot_positions(ALIENGO, ALIENGO.nominal_q + offsets[0])
+
+
+@pytest.fixture
+def weightless(monkeypatch):
+    monkeypatch.setattr(scripted_trot, "LOAD", 0.0)  # no torque fed forward: joints have the feet's targets
+
+
+def test_a_robot_that_stays_too_slow_places_its_feet_behind_and_one_that_drifts_aside(weightless):
+    env = VelocityEnv(CALM)
+    usual = walking_feet(env, [1.0, 0.0, 0.0], [0.0, 0.0])
+    moved = walking_feet(env, [1.0, 0.0, 0.0], [0.1, -0.1]) - usual
+    assert moved[:, :2] == pytest.approx(np.tile([-0.018, 0.018], (4, 1)), abs=2e-3)
+
+
+def test_in_a_curve_the_feet_are_placed_out_by_what_the_centripetal_acceleration_takes(weightless):
+    env = VelocityEnv(CALM)
+    left, right = (walking_feet(env, [1.5, 0.0, turn], [0.0, 0.0]) for turn in (1.0, -1.0))
+    # a trunk at height h accelerates by g d / h towards the side from which its feet are d away
+    out = 0.73 * 1.5 * 1.0 * 0.37 / 9.81
+    assert (right - left)[:, 1].mean() == pytest.approx(2 * out, rel=0.05)
 
 
 def test_a_sample_of_20_ms_is_four_ticks_of_5():
@@ -163,6 +195,7 @@ def test_an_error_that_lasts_is_that_of_this_command_alone_and_without_its_begin
     past, error = Past(env), np.array([0.4, -0.2, 0.3])
     command = np.zeros((4, 4))
     command[:, :2], command[:, 2] = env.velocity[:, :2] + error[:2], env.angular_velocity[:, 2] + error[2]
+    past.clock.velocity[:] = command[:, :3]
     env.changed[:] = False
     for _ in range(round(0.9 * privileged.TRANSIENT_S / env.config.period)):
         past.advance(command)

@@ -82,8 +82,8 @@ class Past:
         env: environments.
         stride: (n, 3), command minus velocity in vx, vy (m/s) and yaw rate (rad/s), low-passed over
             `STRIDE_S`.
-        lasting: (n, 3), the same over `LASTING_S`; set to zero by a new command, it starts
-            `TRANSIENT_S` after it.
+        lasting: (n, 3), the same over `LASTING_S`; set to zero by a new command, it starts when the
+            plan has had the commanded velocity for `TRANSIENT_S`.
         air: (n, 4), s since the foot left the ground; 0 on the ground.
         down: (n, 4), s since the foot touched the ground; 0 in the air.
         clock: plan of the steps.
@@ -102,7 +102,7 @@ class Past:
         self.stride, self.lasting = np.zeros((n, 3)), np.zeros((n, 3))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
         self.off_hip, self.clock = np.zeros((n, 4)), GaitClock(n)
-        self._age = np.zeros(n)  # age of the command, s
+        self._age = np.zeros(n)  # s, since the plan has the commanded velocity
         self._landed, self._last = np.zeros((n, 4)), np.zeros((n, 4))  # m ahead of the hip: at touchdown, now
 
     def reset(self, ids: np.ndarray, other_pair: np.ndarray | bool = False) -> None:
@@ -126,7 +126,7 @@ class Past:
         # First-order low-pass filters: x <- x + (e - x) dt / T
         error = velocity_error(env, command)
         self.stride += (error - self.stride) * period / STRIDE_S
-        self._age += period
+        self._age += period * (self.clock.velocity == command[:, :3]).all(axis=1)
         settled = (self._age > TRANSIENT_S)[:, None]
         self.lasting += (error - self.lasting) * settled * period / LASTING_S
         self.lasting[env.changed] = self._age[env.changed] = 0.0
@@ -226,7 +226,7 @@ def total_action(env: VelocityEnv, past: Past, correction: np.ndarray) -> np.nda
     Returns:
         (n, 12), action in the network's unit, within `ACTION_BOUND`.
     """
-    scripted = joint_offsets(env, past.clock) / ACTION_SCALE
+    scripted = joint_offsets(env, past.clock, past.lasting[:, :2]) / ACTION_SCALE
     return np.clip(scripted + correction, -ACTION_BOUND, ACTION_BOUND).astype(np.float32)
 
 

@@ -1,10 +1,10 @@
 """Scripted trot that the teacher's network corrects.
 
-Feet follow the gait clock: swings rise and return, stances sweep at the planned velocity. Four
-feedbacks of the true state keep nominal robots on their feet to 2.5 m/s on level ground: feet are
-placed by the excess velocity, the trunk is levelled and kept at its height, feet turn against a wrong
-yaw rate. Their gains were found by a search over walks of robots drawn as in training, with a
-trained correction.
+Feet follow the gait clock: swings rise and return, stances sweep at the planned velocity. Feedbacks
+of the true state keep robots on their feet: feet are placed by the excess velocity and by the lasting
+error, the trunk is levelled and kept at its height, feet turn against a wrong yaw rate. In curves the
+feet are placed further out. The gains were found by a search over walks of robots drawn as in
+training, with a trained correction.
 """
 
 from __future__ import annotations
@@ -12,35 +12,40 @@ from __future__ import annotations
 import numpy as np
 
 from quadvel_description.kinematics import foot_positions, inverse_kinematics
+from quadvel_description.quadruped import GRAVITY
 
 from .env import VelocityEnv
 from .gait_clock import GaitClock, duty_factor, step_frequency
 
 HEIGHT_M = 0.37  # of the trunk above ground
-CROUCH_M = 0.038  # by which the trunk is lower than in the nominal posture: longer steps are in reach
-LIFT_M = 0.105  # height of a swing
-LONGEST_STEP_M = 0.245  # way of a foot under the trunk in one stance
-LEAD_S = 0.05  # joints follow their targets so late
-PLACEMENT_S = np.array([0.13, 0.13])  # x, y: feet are placed this time times the excess velocity out,
-BEHIND_S = np.array([0.08, 0.03])  # and this time times the planned velocity behind, which drives
-MAX_BEHIND = np.array([0.4, 2.0])  # m/s, planned velocity that counts
+CROUCH_M = 0.037  # by which the trunk is lower than in the nominal posture: longer steps are in reach
+LIFT_M = 0.095  # height of a swing
+LONGEST_STEP_M = 0.255  # way of a foot under the trunk in one stance
+LEAD_S = 0.054  # joints follow their targets so late
+PLACEMENT_S = np.array([0.137, 0.114])  # x, y: feet are placed this time times the excess velocity out,
+BEHIND_S = np.array([0.072, 0.034])  # this time times the planned velocity behind, which drives,
+LASTING_S = 0.18  # and this time times the lasting error behind
+MAX_BEHIND = np.array([0.45, 2.0])  # m/s, planned velocity that counts
 MAX_EXCESS = 0.5  # m/s, excess velocity that counts
+MAX_LASTING = 0.16  # m/s, lasting error that counts
+CURVE = 0.73  # share of the acceleration in a curve for which feet are placed out
 YAW_GAIN = 0.5  # stances turn faster by this share of the excess yaw rate,
-TURN_S = 0.04  # and feet are turned about the trunk by this time times it
+TURN_S = 0.033  # and feet are turned about the trunk by this time times it
 MAX_YAW_EXCESS = 1.5  # rad/s, excess yaw rate that counts
-LEVELLING = np.array([1.25, 1.4])  # roll, pitch: share of the tilt that stance feet push back
-RATE_S = np.array([0.03, 0.1])  # time that a roll or pitch rate is extrapolated
-HEIGHT_GAIN = 0.55  # share of the height above HEIGHT_M by which stance feet of a walk give way,
+LEVELLING = np.array([1.04, 1.58])  # roll, pitch: share of the tilt that stance feet push back
+RATE_S = np.array([0.025, 0.088])  # time that a roll or pitch rate is extrapolated
+HEIGHT_GAIN = 0.57  # share of the height above HEIGHT_M by which stance feet of a walk give way,
 MAX_HEIGHT_ERROR_M = 0.1  # up to this error
-LOAD = 1.4  # share of the load of a stance foot that is fed forward
+LOAD = 1.7  # share of the load of a stance foot that is fed forward
 
 
-def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
+def joint_offsets(env: VelocityEnv, clock: GaitClock, lasting: np.ndarray) -> np.ndarray:
     """Return the joint targets of the scripted trot, relative to those of standing.
 
     Args:
         env: environments.
         clock: gait clock of their robots.
+        lasting: (n, 2), m/s, command minus velocity over seconds, forward and left.
 
     Returns:
         (n, 12), rad.
@@ -65,8 +70,11 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
     along = np.where(down, 1.0 - 2.0 * phases / duty[:, None], -np.cos(np.pi * swing))
     along *= clock.walking[:, None]
     # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_planned) - BEHIND_S clip(v_planned)
-    #     + TURN_S (w_z - w_planned) x (x_nominal)
+    #     - LASTING_S clip(e_lasting) - CURVE (h / g) w x v + TURN_S (w_z - w_planned) x (x_nominal)
+    # A trunk at height h above feet that are a distance d aside accelerates by g d / h.
     placed = PLACEMENT_S * excess - BEHIND_S * np.clip(planned[:, :2], -MAX_BEHIND, MAX_BEHIND)
+    placed -= LASTING_S * np.clip(lasting, -MAX_LASTING, MAX_LASTING) * clock.walking[:, None]
+    placed -= CURVE * HEIGHT_M / GRAVITY * _turned(planned[:, None, :2], planned[:, 2])[:, 0]
     feet = np.broadcast_to(below, (n, 4, 3)).copy()
     feet[..., :2] += 0.5 * way * along[..., None] + placed[:, None, :] + _turned(below, TURN_S * turning)
     # z_foot = z_nominal + LIFT_M sin^2(pi s); a stance foot on the lower side of the trunk pushes
@@ -83,5 +91,5 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock) -> np.ndarray:
 
 
 def _turned(feet: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Displacement (n, 4, 2) of feet (4, 3) that are turned by a small angle (n,) about the trunk."""
-    return np.stack([-feet[:, 1], feet[:, 0]], axis=-1) * angle[:, None, None]
+    """Displacement of feet (..., 4, 2 or more) that are turned by a small angle (n,) about the trunk."""
+    return np.stack([-feet[..., 1], feet[..., 0]], axis=-1) * angle[:, None, None]

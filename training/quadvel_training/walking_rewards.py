@@ -126,7 +126,7 @@ class WalkingWeights:
     off_hip: float = 4.0
     sway: float = 10.0
     roll: float = 0.1
-    overspeed: float = 0.1
+    overspeed: float = 0.3
     slow: float = 5.0
     hips: float = 1.0
     posture: float = 0.2
