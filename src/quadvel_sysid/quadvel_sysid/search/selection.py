@@ -126,7 +126,9 @@ class Search:
             return SearchResult(effects, effects, record)
         # Otherwise up to two effects compete with one regressor of named signals.
         regressors = self.extend(plain, REGRESSORS, record, most=1)
-        effects = self.extend(effects, EFFECTS, record, most=2, bound=regressors.criterion)
+        effects = self._with_special_cases(
+            self.extend(effects, EFFECTS, record, most=2, bound=regressors.criterion)
+        )
         if not effects.is_white:
             regressors = self.extend(regressors, REGRESSORS, record)
         # Among models with nearly equal criteria the one with the fewest regressors counts.
@@ -216,6 +218,18 @@ class Search:
             fitted.model.with_replaced_effect(index, attrs.evolve(effect, candidate=candidate, values=values))
         )
         return fitted if self._is_needed(simpler, fitted) else simpler
+
+    def _with_special_cases(self, fitted: FittedModel) -> FittedModel:
+        """Replace effects by special cases that lower the criterion.
+
+        The general case may have its best parameters at infinity: a constant torque is a spring
+        without stiffness that rests infinitely far away.
+        """
+        if not fitted.is_white:
+            for k in range(len(fitted.model.effects)):
+                simpler = self._replace_by_special_case(fitted, k)
+                fitted = min(fitted, simpler, key=lambda one: one.criterion)
+        return fitted
 
     def extend(
         self,
