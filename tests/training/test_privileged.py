@@ -128,19 +128,19 @@ def test_the_mirrored_robot_observes_the_mirror_image():
     env._update_state()
     past.advance(env.command)
     past.clock.phase[:] = [0.2, 0.7]  # mirrored steps come half a cycle later
-    past.lasting[:] = [[0.1, 0.05, 0.2], [0.1, -0.05, -0.2]]
-    trot = joint_offsets(env, past.clock, past.lasting[:, :2])
+    past.lag[:] = [[0.1, 0.05], [0.1, -0.05]]
+    trot = joint_offsets(env, past.clock, past.lag)
     assert trot[1] == pytest.approx(symmetry.JOINTS(trot[0]), abs=1e-4)
     one, other = privileged.observe(env, past, np.stack([joints, symmetry.JOINTS(joints)]))
     assert np.allclose(privileged.MIRROR(one), other, atol=1e-5)
 
 
-def walking_feet(env: VelocityEnv, planned: list[float], lasting: list[float]) -> np.ndarray:
+def walking_feet(env: VelocityEnv, planned: list[float], lag: list[float]) -> np.ndarray:
     """Feet (4, 3) of the scripted trot of a robot that moves as planned."""
     clock = GaitClock(4)
     clock.walking[:], clock.velocity[:] = True, planned
     env.velocity[:, :2], env.angular_velocity[:] = planned[:2], [0.0, 0.0, planned[2]]
-    offsets = joint_offsets(env, clock, np.tile(lasting, (4, 1)))
+    offsets = joint_offsets(env, clock, np.tile(lag, (4, 1)))
     return foot_positions(ALIENGO, ALIENGO.nominal_q + offsets[0])
 
 
@@ -149,11 +149,11 @@ def weightless(monkeypatch):
     monkeypatch.setattr(scripted_trot, "LOAD", 0.0)  # no torque fed forward: joints have the feet's targets
 
 
-def test_a_robot_that_stays_too_slow_places_its_feet_behind_and_one_that_drifts_aside(weightless):
+def test_a_robot_that_lags_behind_places_its_feet_behind_and_one_that_drifts_aside(weightless):
     env = VelocityEnv(CALM)
     usual = walking_feet(env, [1.0, 0.0, 0.0], [0.0, 0.0])
-    moved = walking_feet(env, [1.0, 0.0, 0.0], [0.1, -0.1]) - usual
-    assert moved[:, :2] == pytest.approx(np.tile([-0.018, 0.018], (4, 1)), abs=2e-3)
+    moved = walking_feet(env, [1.0, 0.0, 0.0], [0.2, -0.2]) - usual
+    assert moved[:, :2] == pytest.approx(np.tile([-0.02, 0.02], (4, 1)), abs=2e-3)
 
 
 def test_in_a_curve_the_feet_are_placed_out_by_what_the_centripetal_acceleration_takes(weightless):
@@ -203,6 +203,7 @@ def test_an_error_that_lasts_is_that_of_this_command_alone_and_without_its_begin
     for _ in range(round(10 * privileged.LASTING_S / env.config.period)):
         past.advance(command)
     assert past.lasting == pytest.approx(np.tile(error, (4, 1)), rel=1e-3)
+    assert past.lag == pytest.approx(np.tile([privileged.MAX_LAG_M, -privileged.MAX_LAG_M], (4, 1)))
     env.changed[1] = True
     past.advance(command)
     env.changed[:] = False

@@ -43,6 +43,7 @@ ACTION_SCALE = 0.4  # rad per unit of the network's output
 ACTION_BOUND = 4.0  # in the network's unit
 STRIDE_S = 0.35  # time constant of stride errors: about a stride
 LASTING_S = 1.5  # time constant of lasting errors
+MAX_LAG_M = 0.4  # a robot that does not follow is not to make up for more later
 TRANSIENT_S = 1.0  # after a new command, not part of lasting errors and scores
 STANDING_S = 0.2  # on four feet; after that, setting off means choosing a side
 WALKING_HEIGHT_M = 0.38  # typical height of the trunk
@@ -84,6 +85,7 @@ class Past:
             `STRIDE_S`.
         lasting: (n, 3), the same over `LASTING_S`; set to zero by a new command, it starts when the
             plan has had the commanded velocity for `TRANSIENT_S`.
+        lag: (n, 2), m, the integral of the error in vx and vy, over the same time as `lasting`.
         air: (n, 4), s since the foot left the ground; 0 on the ground.
         down: (n, 4), s since the foot touched the ground; 0 in the air.
         clock: plan of the steps.
@@ -99,7 +101,7 @@ class Past:
         """
         n = env.config.n
         self.env, self._hips_ahead = env, env.robot.legs.hips[:, 0]  # m, body frame
-        self.stride, self.lasting = np.zeros((n, 3)), np.zeros((n, 3))
+        self.stride, self.lasting, self.lag = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 2))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
         self.off_hip, self.clock = np.zeros((n, 4)), GaitClock(n)
         self._age = np.zeros(n)  # s, since the plan has the commanded velocity
@@ -112,7 +114,7 @@ class Past:
             ids: their indices.
             other_pair: (len(ids),) bool, whether their walks start with the feet FL and RR.
         """
-        for array in (self.stride, self.lasting, self.air, self.down, self.off_hip, self._age):
+        for array in (self.stride, self.lasting, self.lag, self.air, self.down, self.off_hip, self._age):
             array[ids] = 0.0
         self.clock.reset(ids, other_pair)
 
@@ -129,6 +131,8 @@ class Past:
         self._age += period * (self.clock.velocity == command[:, :3]).all(axis=1)
         settled = (self._age > TRANSIENT_S)[:, None]
         self.lasting += (error - self.lasting) * settled * period / LASTING_S
+        self.lag = np.clip(self.lag + error[:, :2] * settled * period, -MAX_LAG_M, MAX_LAG_M)
+        self.lag[env.changed] = 0.0
         self.lasting[env.changed] = self._age[env.changed] = 0.0
         self._advance_stances()
         speed = np.hypot(env.velocity[:, 0], env.velocity[:, 1])
@@ -226,7 +230,7 @@ def total_action(env: VelocityEnv, past: Past, correction: np.ndarray) -> np.nda
     Returns:
         (n, 12), action in the network's unit, within `ACTION_BOUND`.
     """
-    scripted = joint_offsets(env, past.clock, past.lasting[:, :2]) / ACTION_SCALE
+    scripted = joint_offsets(env, past.clock, past.lag) / ACTION_SCALE
     return np.clip(scripted + correction, -ACTION_BOUND, ACTION_BOUND).astype(np.float32)
 
 

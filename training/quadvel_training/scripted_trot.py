@@ -1,10 +1,10 @@
 """Scripted trot that the teacher's network corrects.
 
 Feet follow the gait clock: swings rise and return, stances sweep at the planned velocity. Feedbacks
-of the true state keep robots on their feet: feet are placed by the excess velocity and by the lasting
-error, the trunk is levelled and kept at its height, feet turn against a wrong yaw rate. In curves the
-feet are placed further out. The gains were found by a search over walks of robots drawn as in
-training, with a trained correction.
+of the true state keep robots on their feet: feet are placed by the excess velocity and by the way
+that the robot lags behind, the trunk is levelled and kept at its height, feet turn against a wrong
+yaw rate. In curves the feet are placed further out. The gains were found by a search over walks of
+robots drawn as in training, with a trained correction.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ LONGEST_STEP_M = 0.255  # way of a foot under the trunk in one stance
 LEAD_S = 0.054  # joints follow their targets so late
 PLACEMENT_S = np.array([0.137, 0.114])  # x, y: feet are placed this time times the excess velocity out,
 BEHIND_S = np.array([0.072, 0.034])  # this time times the planned velocity behind, which drives,
-LASTING_S = 0.18  # and this time times the lasting error behind
+DRAG = np.array([0.006, 0.0])  # s^2/m, this times its square behind, for what steps lose,
+CATCH_UP = 0.1  # and this share of the way that the robot lags behind its command
 MAX_BEHIND = np.array([0.45, 2.0])  # m/s, planned velocity that counts
 MAX_EXCESS = 0.5  # m/s, excess velocity that counts
-MAX_LASTING = 0.16  # m/s, lasting error that counts
 CURVE = 0.73  # share of the acceleration in a curve for which feet are placed out
 YAW_GAIN = 0.5  # stances turn faster by this share of the excess yaw rate,
 TURN_S = 0.033  # and feet are turned about the trunk by this time times it
@@ -39,13 +39,13 @@ MAX_HEIGHT_ERROR_M = 0.1  # up to this error
 LOAD = 1.7  # share of the load of a stance foot that is fed forward
 
 
-def joint_offsets(env: VelocityEnv, clock: GaitClock, lasting: np.ndarray) -> np.ndarray:
+def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.ndarray:
     """Return the joint targets of the scripted trot, relative to those of standing.
 
     Args:
         env: environments.
         clock: gait clock of their robots.
-        lasting: (n, 2), m/s, command minus velocity over seconds, forward and left.
+        lag: (n, 2), m, integral of the command minus the velocity, forward and left.
 
     Returns:
         (n, 12), rad.
@@ -70,10 +70,12 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock, lasting: np.ndarray) -> np
     along = np.where(down, 1.0 - 2.0 * phases / duty[:, None], -np.cos(np.pi * swing))
     along *= clock.walking[:, None]
     # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_planned) - BEHIND_S clip(v_planned)
-    #     - LASTING_S clip(e_lasting) - CURVE (h / g) w x v + TURN_S (w_z - w_planned) x (x_nominal)
+    #     - DRAG |v_planned| v_planned - CATCH_UP lag - CURVE (h / g) w x v_planned
+    #     + TURN_S (w_z - w_planned) x (x_nominal)
     # A trunk at height h above feet that are a distance d aside accelerates by g d / h.
     placed = PLACEMENT_S * excess - BEHIND_S * np.clip(planned[:, :2], -MAX_BEHIND, MAX_BEHIND)
-    placed -= LASTING_S * np.clip(lasting, -MAX_LASTING, MAX_LASTING) * clock.walking[:, None]
+    placed -= DRAG * np.abs(planned[:, :2]) * planned[:, :2]
+    placed -= CATCH_UP * lag * clock.walking[:, None]
     placed -= CURVE * HEIGHT_M / GRAVITY * _turned(planned[:, None, :2], planned[:, 2])[:, 0]
     feet = np.broadcast_to(below, (n, 4, 3)).copy()
     feet[..., :2] += 0.5 * way * along[..., None] + placed[:, None, :] + _turned(below, TURN_S * turning)
