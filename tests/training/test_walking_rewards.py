@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_description.quadruped import joint_index  # noqa: E402
 from quadvel_eval.gait_kind import GaitKind  # noqa: E402
-from quadvel_training import gait_log  # noqa: E402
+from quadvel_training import teacher_walks  # noqa: E402
 from quadvel_training.command_grid import CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.gait_clock import duty_factor  # noqa: E402
@@ -153,9 +153,11 @@ def test_a_rated_drive_gives_full_torque_at_rest_and_none_at_its_top_speed():
 
 def test_the_kind_of_gait_is_logged_at_each_speed_with_each_numbered_checkpoint(tmp_path, capsys):
     run = PrivilegedRun(PrivilegedConfig(n=6, threads=1, length=4, keep=1000.0))
-    figures = gait_log.GaitLog(run, tmp_path).keep()
+    figures = teacher_walks.WalkLog(run, tmp_path).keep()
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in lines] == [f"gait at {s:g} m/s" for s in gait_log.SPEEDS]
-    fell = [line.endswith("fell") for line in lines]
-    assert len(figures) == len(attrs.fields(GaitKind)) * fell.count(False)
+    assert [line.split(":")[0] for line in lines] == [
+        f"walk at {vx:g}, 0 m/s, 0 rad/s" for vx, _, _ in teacher_walks.LOGGED_COMMANDS
+    ]
+    fell = ["1 of 1 fell" in line for line in lines]
+    assert len(figures) == (len(attrs.fields(GaitKind)) + 1) * fell.count(False)
     assert (tmp_path / "kept" / "000000k.pt").is_file()

@@ -37,6 +37,7 @@ from . import (
     recipe,
     run_folder,
     stages,
+    teacher_walks,
 )
 from .card import card
 
@@ -104,6 +105,21 @@ def train_privileged(
     Numbered checkpoints go to DIR/kept. To resume from one, copy it to DIR/privileged.pt and run the command again.
     """
     stages.train_teacher(_configured(privileged.PrivilegedConfig, source, minutes), source, out)
+
+
+@app.command("walks")
+def walk_teacher(
+    teacher: TeacherFile = TEACHER,
+    source: Recipe = stages.RECIPES / "privileged.yaml",
+    robots: Annotated[int, typer.Option(min=1, help="Number of robots for each command.")] = 16,
+) -> None:
+    """Let the teacher walk at constant commands, and print falls, velocity and kind of gait.
+
+    Robots are drawn and pushed as the recipe says.
+    """
+    config = recipe.read_recipe(privileged.PrivilegedConfig, source)
+    for one in teacher_walks.walk_drawn_robots(teacher, config, robots):
+        print(one.line, flush=True)
 
 
 @app.command("dagger")

@@ -14,10 +14,10 @@ from . import loop, process_group, recipe
 from .constrained import ConstrainedConfig, ConstrainedRun
 from .dagger import DaggerConfig, DaggerRun, export_policy, load_policy
 from .estimator import EstimatorConfig, EstimatorRun
-from .gait_log import GaitLog
 from .loop import Budget
 from .privileged import PrivilegedConfig, PrivilegedRun
 from .run_folder import EvaluatedPolicies, training_record, write_run_file
+from .teacher_walks import WalkLog
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 TEACHER_PARTS = ("privileged", "privileged_rough")  # recipes, in order
@@ -46,7 +46,7 @@ def train_teacher(config: PrivilegedConfig, source: Path | None, folder: Path) -
     """
     run = PrivilegedRun(config)
     write_run_file(folder, "privileged", source, config)
-    return loop.train(run, config.budget, folder / TEACHER, GaitLog(run, folder))
+    return loop.train(run, config.budget, folder / TEACHER, WalkLog(run, folder))
 
 
 def train_student(config: DaggerConfig, source: Path | None, teacher: Path, folder: Path) -> bool:
