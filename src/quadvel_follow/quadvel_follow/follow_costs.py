@@ -1,4 +1,7 @@
-"""Cost of rollouts of a robot that follows a person. No ROS, no search."""
+"""Cost of rollouts of a robot that follows a person. No ROS, no search.
+
+`rollouts` predicts the motions and `dynamic_window` searches for the cheapest one.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Prediction of the robot's motion under velocity commands: limits, first-order lag, and poses."""
+"""Prediction of the robot's motion under velocity commands: limits, first-order lag, and poses.
+
+`dynamic_window` searches the commands and `follow_costs` rates the rollouts. Velocities are in the
+body frame, poses in the frame of the given pose (odometry).
+"""
 
 from __future__ import annotations
 
