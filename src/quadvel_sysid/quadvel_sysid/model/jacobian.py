@@ -1,4 +1,7 @@
-"""Jacobian of the torque: derivatives with respect to gains, effect parameters and delays."""
+"""Jacobian of the torque: derivatives with respect to gains, effect parameters and delays.
+
+`fit` solves the normal equations with it, and `statistics.confidence` derives standard errors.
+"""
 
 from __future__ import annotations
 
