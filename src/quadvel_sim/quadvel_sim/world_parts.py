@@ -1,4 +1,8 @@
-"""Parts of a world: walls, boxes, trees, tables, patches, hills, people. Each adds its own geoms."""
+"""Parts of a world: walls, boxes, trees, tables, patches, hills, people. Each adds its own geoms.
+
+`world` reads the list of parts from a file, and `persons` moves the people. Positions are in the
+world frame, m; yaw in a file is in degrees.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Runs the fault campaign: every fault in every relevant mode, with random seeds, against its oracle."""
+"""Runs the fault campaign: each fault in each relevant mode with random seeds, against an oracle.
+
+`injection` makes the faults, `stack` simulates robot and nodes, `cases` has the oracles, and
+`report` writes the result.
+"""
 
 from __future__ import annotations
 
