@@ -1,4 +1,7 @@
-"""Kind of gait of the teacher at some speeds, logged with each numbered checkpoint of stage 1."""
+"""Kind of gait of the teacher at some speeds, logged with each numbered checkpoint of stage 1.
+
+`quadvel_eval.gait_kind` classifies the gait. The result is only logged: no reward depends on it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Training of the leg classifier for laser scans, and its file for `quadvel_follow.LegDetector`."""
+"""Training of the leg classifier for laser scans, and its file for `quadvel_follow.LegDetector`.
+
+`leg_examples` makes the examples, and `quadvel_eval.people.measure` scores the result.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Training loop of every stage: budget, progress, curves, time shares and atomic checkpoints."""
+"""Training loop of every stage: budget, progress, curves, time shares and atomic checkpoints.
+
+The stages (`privileged`, `constrained`, `dagger`, `estimator`) supply what is learned in one step.
+"""
 
 from __future__ import annotations
 
