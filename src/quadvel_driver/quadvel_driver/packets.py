@@ -1,4 +1,7 @@
-"""Parts that the packets of all of Unitree's boards share: CRC, wireless remote, errors. No sockets."""
+"""Parts that the packets of all Unitree boards share: CRC, wireless remote, errors. No sockets.
+
+`wire` (UDP boards) and `unitree_dds.wire` (CDR samples) encode their packets with it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Selection of the samples of a stream that a periodic loop answers."""
+"""Selection of the samples of a stream that a periodic loop answers.
+
+`tracker` of the estimator and `control_loop` of the policy ask it which samples to use.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""State of a robot as known from its topics, live or recorded. No ROS, no drawing."""
+"""State of a robot as known from its topics, live or recorded. No ROS, no drawing.
+
+`scene` draws it, `panel` turns it into readings, and `view_node` or `playback` fills it.
+"""
 
 from __future__ import annotations
 
