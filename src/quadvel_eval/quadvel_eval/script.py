@@ -96,7 +96,7 @@ class Action:
     Attributes:
         step: Name of the step.
         requested_mode: Mode to request, or None.
-        velocity: Velocity to command, or None.
+        velocity: Velocity to command: vx, vy (m/s), wz (rad/s), body frame; None: no command.
     """
 
     step: str

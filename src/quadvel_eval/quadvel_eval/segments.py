@@ -100,8 +100,8 @@ def response_delay(commanded: Array, velocity: Array, period: float) -> float | 
     means over the second half, so that a steady-state error does not count as delay.
 
     Args:
-        commanded: Commanded velocity (n,).
-        velocity: Measured velocity (n,), same unit.
+        commanded: Commanded velocity of one axis, (n,), m/s or rad/s.
+        velocity: Measured velocity of that axis, (n,), in the same unit.
         period: Sampling period, s.
 
     Returns:

@@ -101,7 +101,7 @@ class Wall:
         Args:
             spec: Model that is extended.
             name: Name of the geom or its prefix.
-            height: Height of the ground.
+            height: Function from x, y (m) to the height of the ground, m.
         """
         for k, (begin, end) in enumerate(itertools.pairwise(self.points)):
             centre, side = 0.5 * (begin + end), end - begin
@@ -131,7 +131,7 @@ class Box:
         Args:
             spec: Model that is extended.
             name: Name of the geom.
-            height: Height of the ground.
+            height: Function from x, y (m) to the height of the ground, m.
         """
         yaw = np.radians(self.yaw)
         _add_upright(spec, name, _BOX, self.position, self.size, yaw, _RGBA["box"], height)
@@ -157,7 +157,7 @@ class Trees:
         Args:
             spec: Model that is extended.
             name: Prefix of the geom names.
-            height: Height of the ground.
+            height: Function from x, y (m) to the height of the ground, m.
         """
         size = [self.radius, self.radius, self.height]
         for k, position in enumerate(self.positions):
@@ -186,7 +186,7 @@ class Table:
         Args:
             spec: Model that is extended.
             name: Name of the board, prefix of the legs' names.
-            height: Height of the ground.
+            height: Function from x, y (m) to the height of the ground, m.
         """
         yaw = np.radians(self.yaw)
         for k, corner in enumerate(self.legs):

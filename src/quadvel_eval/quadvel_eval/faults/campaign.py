@@ -54,8 +54,9 @@ class FaultRun:
         safe_after: Time until the expected end: damped, or standing.
         ended: Final mode of the supervisor.
         fell: Whether the robot fell.
-        torque: Largest torque, divided by the limit of the drive.
-        speed: Largest speed of a joint that its drive accelerates, divided by the drive's limit.
+        torque: Largest torque over the limit of the drive, as a ratio.
+        speed: Largest speed of a joint that its drive accelerates over the drive's limit, as a
+            ratio.
         too_fast: Longest time in which a drive accelerated a joint above MAX_SPEED_RATIO, s.
         beyond: Largest overtravel of a joint beyond its mechanical range, rad.
         wrong: Violations of the oracle, one sentence each.
