@@ -1,4 +1,8 @@
-"""`quadvel calibrate`: encoder and IMU offsets from recordings of the robot hanging and standing."""
+"""`quadvel calibrate`: encoder and IMU offsets from recordings of the robot hanging and standing.
+
+`quadvel_driver.find_calibration` computes the offsets, and `calibration` in the driver applies
+them.
+"""
 
 from __future__ import annotations
 

@@ -180,7 +180,7 @@ class Link:
             on_state: Called in the link's thread with each new state; `time` (s) is on `clock`,
                 `tick` in ms.
             calibration: Calibration of this robot, which corrects states and commands.
-            takeover: Right to command the joints; None for a board that obeys whoever sends.
+            takeover: Right to command the joints; None for a board that obeys every sender.
             clock: A monotonic clock, s.
         """
         self._robot = robot

@@ -118,7 +118,8 @@ def decode_remote(data: bytes) -> Remote:
         data: 40 bytes.
 
     Returns:
-        Its state; that of a remote that is off if a stick is not finite, as no state is refused for it.
+        State of the remote. If a stick is not finite, the remote counts as off: the packet itself
+        is not refused.
     """
     fields = np.frombuffer(data, REMOTE)[0]
     sticks = {stick: float(fields[stick]) for stick in _STICKS}
