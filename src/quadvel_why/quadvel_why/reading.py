@@ -1,4 +1,4 @@
-"""Reads a recording into a `Run`: own topics, another stack's LowState and LowCmd, or a joint table.
+"""Reads a recording into a `Run`: own topics, another stack's topics, or a table of joints.
 
 `run` defines the result, and `quadvel_recordings` decodes the files.
 """
