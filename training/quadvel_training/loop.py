@@ -34,7 +34,7 @@ class Budget:
 
     Attributes:
         samples: number of samples, from the first start.
-        minutes: duration, from the start or the latest resumption.
+        minutes: duration from the start or the latest resumption, minutes.
     """
 
     samples: float
@@ -212,7 +212,7 @@ def linear(start: float, end: float, done: float) -> float:
     Args:
         start: value at 0.
         end: value from 1 on.
-        done: progress.
+        done: progress, 0 to 1; larger values count as 1.
 
     Returns:
         The value at `done`.
@@ -226,7 +226,7 @@ def cosine(start: float, end: float, done: float) -> float:
     Args:
         start: value at 0.
         end: value from 1 on.
-        done: progress.
+        done: progress, 0 to 1; larger values count as 1.
 
     Returns:
         The value at `done`.

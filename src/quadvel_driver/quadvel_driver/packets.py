@@ -154,7 +154,7 @@ def command_numbers(command: JointCommand, location: Location) -> Array:
         location: Names a number in the error.
 
     Returns:
-        q, dq, tau, kp and kd, (5, 12).
+        q (rad), dq (rad/s), tau (N m), kp (N m/rad) and kd (N m s/rad), (5, 12).
 
     Raises:
         WireError: A number is not finite.

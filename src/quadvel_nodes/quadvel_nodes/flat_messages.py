@@ -127,7 +127,7 @@ def encode_estimate(
         frame: Frame of the velocities.
         linear: Linear velocity, (3,), m/s.
         angular: Angular velocity, (3,), rad/s.
-        covariance: Covariance, (36,): x, y, z and the rotations about them.
+        covariance: Covariance, (36,): velocities along x, y, z (m/s) and rates about them (rad/s).
 
     Returns:
         The message in CDR.

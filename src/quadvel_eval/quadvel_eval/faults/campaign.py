@@ -50,8 +50,8 @@ class FaultRun:
         seed: Seed of the run.
         fault: Name of the finding that stopped the robot.
         findings: Names of all findings, in order.
-        named_after: Time until the first expected finding.
-        safe_after: Time until the expected end: damped, or standing.
+        named_after: Time until the first expected finding, s.
+        safe_after: Time until the expected end (damped, or standing), s.
         ended: Final mode of the supervisor.
         fell: Whether the robot fell.
         torque: Largest torque over the limit of the drive, as a ratio.
