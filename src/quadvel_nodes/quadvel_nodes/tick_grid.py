@@ -1,6 +1,6 @@
 """Selection of the samples of a stream that a periodic loop answers.
 
-`tracker` of the estimator and `control_loop` of the policy ask it which samples to use.
+`quadvel_estimator.tracker` and `quadvel_policy.control_loop` ask it which samples to use.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Simulates scenes that are hard for person trackers: crossing, occlusion, walking along walls.
 
-`walker` moves the people, `laser` computes the scans, and `measure` runs the trackers and scores
-them. Positions are in the world frame: m, x and y in the plane; yaw in rad from x to y.
+`quadvel_sim.walker` moves the people, `laser` computes the scans, and `measure` runs the trackers
+and scores them. Positions are in the world frame: m, x and y in the plane; yaw in rad from x to y.
 """
 
 from __future__ import annotations
