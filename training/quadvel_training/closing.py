@@ -37,7 +37,7 @@ def fill_steps(
         plant: plant of the gap.
         policy: policy file that was written from `checkpoint`.
         checkpoint: checkpoint of `constrained`.
-        minutes: how long the policy is tuned.
+        minutes: time for which the policy is tuned, minutes.
         out: folder of the results.
 
     Returns:
@@ -59,7 +59,7 @@ def close_the_loop(plant: str, policy: Path, checkpoint: Path, minutes: float, o
         plant: plant of the gap.
         policy: policy file that was written from `checkpoint`.
         checkpoint: checkpoint of `constrained`.
-        minutes: how long the policy is tuned.
+        minutes: time for which the policy is tuned, minutes.
         out: folder of the results.
 
     Returns:

@@ -62,8 +62,8 @@ class DaggerConfig:
         length: ticks per sequence; 64 are 0.32 s.
         epochs: passes over each sequence.
         mini_batches: optimiser steps per pass.
-        learning_rate: at the start.
-        final_learning_rate: at the end.
+        learning_rate: learning rate of Adam at the start.
+        final_learning_rate: the same at the end; it falls along a cosine.
         driven: share of robots that the student drives at the end.
         first_driven: the same at the start.
         takeover: samples from `first_driven` to `driven`.

@@ -204,8 +204,8 @@ class EstimatorConfig:
         n: number of robots, of all processes together.
         length: ticks per sequence.
         epochs: passes over a sequence; learning costs less than walking.
-        learning_rate: at the start.
-        final_learning_rate: at the end.
+        learning_rate: learning rate of Adam at the start.
+        final_learning_rate: the same at the end; it falls along a cosine.
         mini_batches: mini-batches per epoch.
         truth_first: share of the budget before the policy walks on the estimate.
         seed: seed of all draws.

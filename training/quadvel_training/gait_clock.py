@@ -42,7 +42,7 @@ def step_frequency(velocity: np.ndarray) -> np.ndarray:
     """Planned steps of a foot per second.
 
     Args:
-        velocity: (n, 3), planned.
+        velocity: (n, 3), planned vx, vy (m/s) and yaw rate (rad/s).
 
     Returns:
         (n,), Hz.
@@ -55,7 +55,7 @@ def duty_factor(velocity: np.ndarray) -> np.ndarray:
     """Planned share of a cycle that a foot is on the ground.
 
     Args:
-        velocity: (n, 3), planned.
+        velocity: (n, 3), planned vx, vy (m/s) and yaw rate (rad/s).
 
     Returns:
         (n,).

@@ -1,4 +1,7 @@
-"""Tuning of the Kalman filter's noise on the walks that the learned estimator learns from."""
+"""Tuning of the Kalman filter's noise on the walks that the learned estimator learns from.
+
+`quadvel_estimator.kalman` has the filter, and `walks` the data.
+"""
 
 from __future__ import annotations
 

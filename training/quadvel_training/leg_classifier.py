@@ -1,4 +1,7 @@
-"""Training of the leg classifier for laser scans, and its file for `quadvel_follow.LegDetector`."""
+"""Training of the leg classifier for laser scans, and its file for `quadvel_follow.LegDetector`.
+
+`leg_examples` makes the examples, and `quadvel_eval.people.measure` scores the result.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ class LegConfig:
         share_legs: share of legs in a batch.
         steps: optimiser steps.
         batch: examples per step.
-        learning_rate: at the start; it falls along a cosine.
+        learning_rate: learning rate of AdamW at the start; it falls along a cosine.
         hidden: sizes of the hidden layers.
         dropout: dropout probability.
         seed: seed of all draws.

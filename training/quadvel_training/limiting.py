@@ -1,4 +1,8 @@
-"""Narrower command limits for an existing policy file, where its drives would be overloaded."""
+"""Narrower command limits for a policy file whose fastest commands would overload the drives.
+
+It only writes limits that the caller chose. `quadvel paper --only sustained` measures the load of
+the drives at each command, and `python -m quadvel_training limit` calls this module.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,8 @@ def limit_commands(robot: Robot, policy: Path, limits: VelocityCommandLimits) ->
     Args:
         robot: robot of the policy.
         policy: ONNX file, replaced atomically.
-        limits: new lowest and highest vx, vy (m/s) and wz (rad/s), and limit in curves (m/s^2).
+        limits: new lowest and highest vx, vy (m/s) and wz (rad/s) in the body frame, and the
+            largest lateral acceleration in curves (m/s^2).
 
     Raises:
         ValueError: the limits are wider than those in the file, which the policy was trained for.

@@ -1,4 +1,7 @@
-"""Training loop of every stage: budget, progress, curves, time shares and atomic checkpoints."""
+"""Training loop of every stage: budget, progress, curves, time shares and atomic checkpoints.
+
+The stages (`privileged`, `constrained`, `dagger`, `estimator`) supply what is learned in one step.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ class Budget:
 
     Attributes:
         samples: number of samples, from the first start.
-        minutes: duration, from the start or the latest resumption.
+        minutes: duration from the start or the latest resumption, minutes.
     """
 
     samples: float
@@ -209,7 +212,7 @@ def linear(start: float, end: float, done: float) -> float:
     Args:
         start: value at 0.
         end: value from 1 on.
-        done: progress.
+        done: progress, 0 to 1; larger values count as 1.
 
     Returns:
         The value at `done`.
@@ -223,7 +226,7 @@ def cosine(start: float, end: float, done: float) -> float:
     Args:
         start: value at 0.
         end: value from 1 on.
-        done: progress.
+        done: progress, 0 to 1; larger values count as 1.
 
     Returns:
         The value at `done`.

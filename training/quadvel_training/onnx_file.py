@@ -1,4 +1,7 @@
-"""Export of a recurrent network as an ONNX file of one time step, with the metadata to run it."""
+"""Export of a recurrent network as an ONNX file of one time step, with the metadata to run it.
+
+`quadvel_policy.policy_file` and `quadvel_estimator.learned` read such files.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Domain randomisation (Section 3.4): bodies, friction, actuators, noise and pushes."""
+"""Domain randomisation (Section 3.4): bodies, friction, actuators, noise and pushes.
+
+`env` applies the draws to each robot; `quadvel_actuator` holds the actuator model.
+"""
 
 from __future__ import annotations
 

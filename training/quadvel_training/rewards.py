@@ -22,12 +22,12 @@ class RewardWeights:
         linear_tracking: exp(-e^2 / width^2) of the velocity error in xy.
         angular_tracking: exp(-e^2 / width^2) of the yaw rate error.
         orientation: penalty of |roll| + |pitch|, 1/rad.
-        torso_stability: penalty of roll and pitch rate and of vertical speed.
-        joint_velocity: penalty of squared joint velocities.
-        joint_acceleration: penalty of squared joint accelerations.
-        slippage: penalty of the squared speed of feet in contact.
+        torso_stability: penalty, s/rad and s/m, of roll and pitch rate and of vertical speed.
+        joint_velocity: penalty, s^2/rad^2, of squared joint velocities.
+        joint_acceleration: penalty, s^4/rad^2, of squared joint accelerations.
+        slippage: penalty, s^2/m^2, of the squared horizontal speed of feet in contact.
         energy: penalty of the power of the joints, 1/W.
-        velocity_compensation: reward for speed along the command, up to the commanded one.
+        velocity_compensation: reward, s/m, for speed along the command, up to the commanded speed.
         alive: constant.
         foot_lift_time: reward at touchdown for time in the air beyond 0.2 s, at low speed.
         foot_clearance: reward for clearance of feet in the air up to 0.05 m, at low speed.

@@ -76,12 +76,12 @@ class WalkingWeights:
         lasting_linear: penalty, s/m, of the error low-passed over 1.5 s (`LASTING_S`), xy.
         lasting_angular: penalty, s/rad, of the lasting error, yaw.
         steady: exp(-(e / 0.06)^2) of the lasting error, xy and yaw.
-        bounce: penalty of the trunk's speed along its own z axis, squared.
-        rocking: penalty of roll and pitch rate squared.
-        tilt: penalty of roll and pitch relative to the ground, squared.
-        height: penalty of the height error squared.
+        bounce: penalty, s^2/m^2, of the trunk's speed along its own z axis, squared.
+        rocking: penalty, s^2/rad^2, of roll and pitch rate squared.
+        tilt: penalty, 1/rad^2, of roll and pitch relative to the ground, squared.
+        height: penalty, 1/m^2, of the height error squared.
         power: penalty, 1/W; at speed |c| divided by 1 + |c| / 2.
-        acceleration: penalty of joint accelerations squared.
+        acceleration: penalty, s^4/rad^2, of joint accelerations squared.
         rate: penalty of the change of the action squared.
         bend: penalty of the second difference of the action squared.
         schedule: reward for feet on the ground or in the air as planned, 1 for all four.
@@ -89,14 +89,15 @@ class WalkingWeights:
             the middle of it, 1 for all four.
         slip: penalty, s/m, of the speed of feet in contact.
         off_hip: penalty, 1/m, at lift-off: distance of the middle of a foot's stance from the hip.
-        sway: penalty of the sideways velocity relative to its mean over a stride, squared.
-        roll: penalty of the roll rate squared.
+        sway: penalty, s^2/m^2, of the sideways velocity relative to its mean over a stride,
+            squared.
+        roll: penalty, s^2/rad^2, of the roll rate squared.
         overspeed: penalty, s/rad, of joint speeds beyond `OVERSPEED_SHARE` of their limit.
         slow: factor of `power` at rest; falls to 1 at 1 m/s.
         hips: penalty, 1/rad, of `hip_deviation`.
         posture: penalty in stance, 1/rad, of joints away from the nominal posture.
         step: penalty in stance for each foot in the air.
-        fidget: penalty in stance of joint speeds squared.
+        fidget: penalty in stance, s^2/rad^2, of joint speeds squared.
         constant: added to each sample. It brings the sum near 0: the return that is lost by a fall
             is then small, and so is the noise that falls by pushes bring into all gradients.
         fall: penalty of a fall.

@@ -1,7 +1,7 @@
-"""Fractional delay line for signals that are constant over each step.
+"""Fractional delay line for signals that are constant over each step of the model.
 
 For a delay of (n + f) steps, 0 <= f < 1, the time average of the delayed signal over step k is
-(1 - f) x[k - n] + f x[k - n - 1].
+(1 - f) x[k - n] + f x[k - n - 1]. `model` and `running` delay commands and torques with it.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from quadvel_description.arrays import Array
 
 MAX_DELAY_S = 0.05
+"""Longest delay that a line holds, s."""
 
 _ROUNDING_STEPS = 1e-9  # steps; a delay this close to a multiple of the step counts as one
 
@@ -25,7 +26,8 @@ class DelayLine:
     of times. Leading axes are environments: a signal of shape (N, J) has N delays.
 
     Attributes:
-        length: number of samples in the ring: `MAX_DELAY_S` and two more.
+        length: number of samples in the ring: the steps of `MAX_DELAY_S`, plus 2 for the fraction
+            and for the newest sample.
         head: index of the newest sample. Setting it back undoes pushes.
     """
 
@@ -71,8 +73,7 @@ class DelayLine:
         n = whole.astype(int)
         self._delay = delay
         # With one n for all indices a read is one slice of the ring; otherwise it gathers rows of
-        # the
-        # flattened ring.
+        # the flattened ring.
         self._common = int(n.flat[0]) if np.all(n == n.flat[0]) else None
         self._back = self._row - n.ravel() * self._row.size
         self._fraction = np.broadcast_to(fraction, self._ring.shape[1:]).copy() if fraction.any() else None
@@ -99,7 +100,7 @@ class DelayLine:
         """Interpolate the delayed sample of this step.
 
         Returns:
-            (..., C), a new array.
+            (..., C), a new array, in the unit of the samples.
         """
         # y[k] = (1 - f) x[k - n] + f x[k - n - 1] = x[k - n] + f (x[k - n - 1] - x[k - n])
         sample = self._sample_back(0)

@@ -1,4 +1,7 @@
-"""`quadvel calibrate`: encoder and IMU offsets from recordings of the robot hanging and standing."""
+"""`quadvel calibrate`: encoder and IMU offsets from recordings of the robot hanging and standing.
+
+`quadvel_driver.find_calibration` computes the offsets; `quadvel_driver.calibration` applies them.
+"""
 
 from __future__ import annotations
 

@@ -185,10 +185,10 @@ def twist_to_array(twist: Any) -> Array:
     """Convert a geometry_msgs/Twist to an array.
 
     Args:
-        twist: The message.
+        twist: The message; its velocities are in the body frame.
 
     Returns:
-        (3,) vx, vy (m/s), wz (rad/s).
+        (3,) vx, vy (m/s), wz (rad/s), body frame.
     """
     return np.array([twist.linear.x, twist.linear.y, twist.angular.z])
 

@@ -1,4 +1,7 @@
-"""The nodes of a walking robot, and the parameters of each."""
+"""The nodes of a walking robot, and the parameters of each.
+
+`up` starts the nodes, and `preflight` checks them before.
+"""
 
 from __future__ import annotations
 

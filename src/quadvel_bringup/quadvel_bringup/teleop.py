@@ -117,7 +117,8 @@ class Teleop:
         """Publish the velocity of one period.
 
         Args:
-            velocity: The held velocity (3,), or None.
+            velocity: Velocity that the operator holds, (3,): vx, vy (m/s), wz (rad/s), body frame;
+                None if nothing is held.
         """
         now = time.monotonic()
         if velocity is None:

@@ -1,4 +1,7 @@
-"""ROS arguments of a command line: parameters, parameter files, remappings, log levels."""
+"""ROS arguments of a command line: parameters, parameter files, remappings, log levels.
+
+`rclpy.context` parses the command line with it, and `names` applies the remappings.
+"""
 
 from __future__ import annotations
 

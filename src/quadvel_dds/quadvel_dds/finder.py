@@ -1,4 +1,7 @@
-"""Import hooks for `rclpy` and message packages of the embedded middleware."""
+"""Import hooks for `rclpy` and message packages of the embedded middleware.
+
+`quadvel_dds.install()` registers them; `quadvel_dds.rclpy` and `messages` supply what they import.
+"""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Definitions and serialization come from `rosbags`; a class is created at its first use. As in ROS 2,
 fields are not checked on assignment. A value that cannot be sent raises ValueError when it is
-published, where ROS 2 truncates it or reads past its end.
+published, where ROS 2 truncates it or reads past its end. `wire` sends and receives the bytes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from quadvel_recordings import definitions
 
-Description = Any  # of a field, as rosbags has it: a kind of node, and what it is made of
+Description = Any  # type of a field as rosbags states it: (Nodetype, detail of that node)
 HEADER = b"\x00\x01\x00\x00"  # encapsulation: plain CDR, little endian, no options
 FORMATS = {
     "bool": "?", "byte": "b", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",
@@ -26,7 +26,9 @@ FORMATS = {
 }  # fmt: skip
 
 STORE = get_typestore(Stores.EMPTY)
-"""All definitions; `message_class` adds our classes, where `register` would make one of each type."""
+"""All definitions; no classes yet. `message_class` adds each class when it is needed; the method
+`register` of rosbags would create the classes of all types at once.
+"""
 STORE.fielddefs.update(definitions.STORE.fielddefs)
 
 
@@ -150,6 +152,8 @@ def message_class(typename: str) -> type[Message]:
 def service_class(typename: str) -> type:
     """Create the class of a service, with `Request` and `Response`.
 
+    An unknown type raises KeyError, as in `message_class`.
+
     Args:
         typename: Full name, such as `std_srvs/srv/Trigger`.
 
@@ -166,7 +170,8 @@ def serialize(message: Message, prefix: bytes = b"") -> bytearray:
 
     Args:
         message: The message.
-        prefix: Bytes before the content, a multiple of eight: the header of a service call.
+        prefix: Bytes between the encapsulation header and the message, a multiple of eight: the
+            header of a service call.
 
     Returns:
         CDR bytes with encapsulation header, padded to a multiple of four.
@@ -190,7 +195,7 @@ def deserialize(data: bytes, typename: str, prefix_size: int = 0) -> Any:
     Args:
         data: CDR bytes with encapsulation header.
         typename: Full name of the type.
-        prefix_size: Number of bytes before the content.
+        prefix_size: Number of bytes between the encapsulation header and the message.
 
     Returns:
         The message.

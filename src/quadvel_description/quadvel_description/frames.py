@@ -6,6 +6,10 @@
 
 `base_link` and `trunk` coincide. The trunk carries the mass, and KDL requires a root link of the
 URDF without inertia.
+
+This module only computes poses, from the links of the robot's URDF (`robot.Robot.links`). The
+estimator publishes `base_link` and `base_footprint`, and `quadvel_nodes.robot_view` the other
+links.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Inertia of rigid bodies, alone and fixed to each other."""
+"""Inertia of rigid bodies, alone and fixed to each other.
+
+`robot` and `found_robot` sum the links of a robot with it.
+"""
 
 from __future__ import annotations
 

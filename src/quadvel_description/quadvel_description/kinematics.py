@@ -1,4 +1,8 @@
-"""Leg kinematics and rotations in closed form, with any leading batch axes."""
+"""Leg kinematics and rotations in closed form, with any leading batch axes.
+
+Feet are in the trunk frame, m, and joint angles in rad, unless stated otherwise. Quaternions are
+(w, x, y, z), body to world. `frames` computes the poses of all links.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Records that packages exchange: state of the robot and command to its joints. No ROS."""
+"""Records that packages exchange: state of the robot and command to its joints. No ROS.
+
+`quadvel_nodes.messages` converts them to and from ROS messages, and `quadvel_driver` from packets.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """URDF of a robot from its MJCF, for robots whose maker publishes no usable URDF.
 
 `python -m quadvel_description.urdf_generator FOLDER` writes `robot.urdf` from `robot.xml`; limits of
-torque and speed come from `robot.yaml`. The simulation uses the MJCF.
+torque and speed come from `robot.yaml`. The simulation uses the MJCF; `urdf` reads the result.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ class BoardClock:
         late: Number of states that arrived after a newer one.
         restarts: Number of restarts of the counter.
         unit: Unit of the counter, s; None until it is known.
-        rate: Counts per second if they match no unit, else None.
+        rate: Rate of the counter, counts/s, if it matches no known unit; else None.
     """
 
     def __init__(self) -> None:

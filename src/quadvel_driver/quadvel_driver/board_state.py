@@ -1,4 +1,7 @@
-"""State that a robot's board reports, and the wireless remote, whatever the packets. No ROS."""
+"""State that a robot's board reports, and the wireless remote, for all packet formats. No ROS.
+
+`packets` and the two `wire` modules decode it, and `health` judges it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Dry run: shows the packets that a link would send, for a check without a robot. No ROS."""
+"""Dry run: shows the packets that a link would send, for a check without a robot. No ROS.
+
+`open_link` puts it in place of the transport; `wire` encodes the packets.
+"""
 
 from __future__ import annotations
 

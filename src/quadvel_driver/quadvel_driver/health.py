@@ -1,4 +1,8 @@
-"""Health of robot and link: one sentence for the operator, and values for /diagnostics. No ROS."""
+"""Health of robot and link: one sentence for the operator, and values for /diagnostics. No ROS.
+
+`driver` publishes it. It judges the reports of `link` and the newest state of the board, in the
+units of `LinkReport` and `BoardState`.
+"""
 
 from __future__ import annotations
 

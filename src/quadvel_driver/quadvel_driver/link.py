@@ -132,12 +132,12 @@ class LinkReport:
     """Status of the link.
 
     Attributes:
-        state_rate: States per second since the last report.
-        send_rate: Sent packets per second since the last report.
+        state_rate: Rate of received states since the last report, Hz.
+        send_rate: Rate of sent packets since the last report, Hz.
         silence: Time since the last new state, s; inf before the first one.
         commanded: Whether the board receives commands, not the link's own damping.
         tick_unit: Unit of the board's counter, "ms" or "us"; "" until it is known.
-        counter_rate: Counts per second if they match neither unit, else None.
+        counter_rate: Rate of the board's counter, counts/s, if it matches neither unit; else None.
         counts: Events since the start, see COUNTER_NAMES.
         last_refusal: Why the last refused datagram was not used.
         last_error: The last network error.
@@ -180,7 +180,7 @@ class Link:
             on_state: Called in the link's thread with each new state; `time` (s) is on `clock`,
                 `tick` in ms.
             calibration: Calibration of this robot, which corrects states and commands.
-            takeover: Right to command the joints; None for a board that obeys whoever sends.
+            takeover: Right to command the joints; None for a board that obeys every sender.
             clock: A monotonic clock, s.
         """
         self._robot = robot

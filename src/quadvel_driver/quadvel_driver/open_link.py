@@ -1,4 +1,8 @@
-"""Which link a robot needs: its packets, connection and takeover. No ROS."""
+"""Which link a robot needs: its packets, connection and takeover. No ROS.
+
+`driver` asks for the link. `link` decides what is sent and when; `udp` and `unitree_dds` transport
+it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Parts that the packets of all of Unitree's boards share: CRC, wireless remote, errors. No sockets."""
+"""Parts that the packets of all Unitree boards share: CRC, wireless remote, errors. No sockets.
+
+`wire` (UDP boards) and `unitree_dds.wire` (CDR samples) encode their packets with it.
+"""
 
 from __future__ import annotations
 
@@ -115,7 +118,8 @@ def decode_remote(data: bytes) -> Remote:
         data: 40 bytes.
 
     Returns:
-        Its state; that of a remote that is off if a stick is not finite, as no state is refused for it.
+        State of the remote. If a stick is not finite, the remote counts as off: the packet itself
+        is not refused.
     """
     fields = np.frombuffer(data, REMOTE)[0]
     sticks = {stick: float(fields[stick]) for stick in _STICKS}
@@ -150,7 +154,7 @@ def command_numbers(command: JointCommand, location: Location) -> Array:
         location: Names a number in the error.
 
     Returns:
-        q, dq, tau, kp and kd, (5, 12).
+        q (rad), dq (rad/s), tau (N m), kp (N m/rad) and kd (N m s/rad), (5, 12).
 
     Raises:
         WireError: A number is not finite.

@@ -16,12 +16,12 @@ class Access(Enum):
 
 
 class Takeover:
-    """Right to command the joints; here that of a board that obeys whoever sends first, such as the AlienGo's.
+    """Right to command the joints, for a board that obeys the first sender, such as the AlienGo's.
 
     Attributes:
         access: What may be sent now; read from any thread.
-        problem: Why access is not full, or what the operator has to know of it; one sentence, "" for
-            nothing.
+        problem: One sentence for the operator: why access is not full, or a note on it; "" if there
+            is neither.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,7 @@
-"""UDP connection to a board. No ROS."""
+"""UDP connection to a board. No ROS.
+
+It moves bytes only; `wire` encodes them, and `link` decides what to send and when.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Learned velocity estimator at run time: a recurrent network, one step per sample."""
+"""Learned velocity estimator at run time: a recurrent network, one step per sample.
+
+`features` builds the input, `tracker` feeds the samples, and `quadvel_training.estimator` trains
+it.
+"""
 
 from __future__ import annotations
 

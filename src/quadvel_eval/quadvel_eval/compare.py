@@ -1,4 +1,7 @@
-"""Compares two evaluations of `quadvel eval`: common figures and their difference."""
+"""Compares two evaluations of `quadvel eval`: common figures and their difference.
+
+It reads two finished evaluations and runs nothing; `quadvel eval` runs them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Draws the figures of a demo: velocity tracking, and timing of the control loop."""
+"""Draws the figures of a demo: velocity tracking, and timing of the control loop.
+
+`demo_summary` computes the numbers, and `video` renders the frames above the tracking figure.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Classifies the gait of a walk: which feet move together, step frequency and trunk sway."""
+"""Classifies the gait of a walk: which feet move together, step frequency and trunk sway.
+
+Its inputs are foot contacts and velocities of any source; `quadvel_eval.walk` records them in
+simulation.
+"""
 
 from __future__ import annotations
 

@@ -60,7 +60,8 @@ class CellResult:
         cell: The run.
         segment: Command and mean velocity after the settling time; None if the robot fell.
         jitter: Mean absolute second difference of the joint targets, rad.
-        cot: Cost of transport or of turning (Eq. 10); None if the robot does not follow.
+        cot: Cost of transport or of turning (Eq. 10), without unit; None if the robot does not
+            follow.
         estimator_mse: Mean square error of each estimator over the whole walk, (3,), (m/s)^2.
         estimator_drift: Final dead reckoning error of each estimator, m.
         path_length: Horizontal path length of the trunk, m.

@@ -1,4 +1,8 @@
-"""Runs actuator model and velocity estimator offline on a recording (`quadvel replay`)."""
+"""Runs actuator model and velocity estimator offline on a recording (`quadvel replay`).
+
+`replay` reads the joints and evaluates the actuator model; `recording_plot` draws what was
+recorded. Nothing is fitted: `quadvel identify` does that.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Runs independent calls in parallel, on the cores of this machine or on a Dask cluster."""
+"""Runs independent calls in parallel, on the cores of this machine or on a Dask cluster.
+
+It knows nothing of simulations: `grid`, `faults.campaign` and `paper.study` make the calls.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Defines scripted walks: modes to request, and velocities to command, with durations. No ROS."""
+"""Defines scripted walks: modes to request, and velocities to command, with durations. No ROS.
+
+It only decides what to request at a time; the caller sends it, such as
+`quadvel_lab.scripted_planner`.
+"""
 
 from __future__ import annotations
 
@@ -92,7 +96,7 @@ class Action:
     Attributes:
         step: Name of the step.
         requested_mode: Mode to request, or None.
-        velocity: Velocity to command, or None.
+        velocity: Velocity to command: vx, vy (m/s), wz (rad/s), body frame; None: no command.
     """
 
     step: str

@@ -24,7 +24,7 @@ class Segment:
 
     Attributes:
         command: Commanded vx, vy (m/s) and wz (rad/s), body frame, (3,).
-        mean: Mean true velocity in the same order (3,).
+        mean: Mean true vx, vy (m/s) and wz (rad/s), body frame, (3,).
     """
 
     command: Array
@@ -62,7 +62,7 @@ def measure_segment(
     Args:
         time: Times (n,), s, evenly spaced.
         velocity: True vx, vy (m/s) and wz (rad/s), body frame, (n, 3).
-        command: Command of the segment (3,).
+        command: Command of the segment, (3,), in the units and frame of `velocity`.
         start: Start of the interval, s.
         end: End of the interval, s.
 
@@ -100,8 +100,8 @@ def response_delay(commanded: Array, velocity: Array, period: float) -> float | 
     means over the second half, so that a steady-state error does not count as delay.
 
     Args:
-        commanded: Commanded velocity (n,).
-        velocity: Measured velocity (n,), same unit.
+        commanded: Commanded velocity of one axis, (n,), m/s or rad/s.
+        velocity: Measured velocity of that axis, (n,), in the same unit.
         period: Sampling period, s.
 
     Returns:

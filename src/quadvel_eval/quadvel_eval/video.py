@@ -1,7 +1,8 @@
 """Renders the robot of a recording with MuJoCo: a video, and frames for a figure.
 
-It is a separate program, `python -m quadvel_eval.video RECORDING FOLDER`. MuJoCo reads MUJOCO_GL
-at import, and a broken GL library must not end the caller.
+It is a separate program, `python -m quadvel_eval.video RECORDING FOLDER`, that `quadvel demo`
+starts. MuJoCo reads MUJOCO_GL at import, and a broken GL library must not end the demo.
+`demo_figures` draws the curves below the frames.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from .report import write_figure
 Image = NDArray[np.uint8]
 
 FRAMES_PER_SECOND = 20
-VIDEO_SIZE = (640, 360)
-STRIP_FRAMES = 5
-STRIP_SIZE = (400, 300)
+VIDEO_SIZE = (640, 360)  # width and height, pixels
+STRIP_FRAMES = 5  # frames of the figure, at most
+STRIP_SIZE = (400, 300)  # width and height of each, pixels
 
 
 class Film:
@@ -50,6 +51,7 @@ class Film:
         self._data = mujoco.MjData(self._model)
         self._renderer = mujoco.Renderer(self._model, height, width)
         self._camera = mujoco.MjvCamera()
+        # m, and degrees about the robot in the world frame
         self._camera.distance, self._camera.azimuth, self._camera.elevation = 1.6, 130.0, -16.0
 
     def __enter__(self) -> Film:
@@ -110,7 +112,7 @@ def write_video(robot: Robot, path: Path, recording: Recording) -> None:
 
     Args:
         robot: The robot.
-        path: The file.
+        path: The MP4 file.
         recording: The recording.
     """
     from imageio_ffmpeg import write_frames

@@ -301,7 +301,7 @@ def cost_of_transport(power: float, mass: float, command: Array, mean: Array) ->
         power: Mean power of the drives, W.
         mass: Mass of robot and payload, kg.
         command: Commanded vx, vy (m/s) and wz (rad/s), (3,).
-        mean: Mean true velocity in the same order (3,).
+        mean: Mean true vx, vy (m/s) and wz (rad/s), body frame, (3,).
 
     Returns:
         The dimensionless cost; None for a zero command, or if the robot does not move along it.

@@ -1,4 +1,7 @@
-"""Draws a world from above (`quadvel world`)."""
+"""Draws a world from above (`quadvel world`).
+
+`quadvel_sim.world` reads the world file. The map is in the world frame, m.
+"""
 
 from __future__ import annotations
 

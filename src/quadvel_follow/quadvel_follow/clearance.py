@@ -1,4 +1,8 @@
-"""Distance between the robot's outline and obstacle points in the plane, for batches of poses."""
+"""Distance between the robot's outline and obstacle points in the plane, for batches of poses.
+
+`obstacle_memory` supplies the points; `follow_costs` turns distances into costs. Points and poses
+are in the odometry frame, m and rad.
+"""
 
 from __future__ import annotations
 

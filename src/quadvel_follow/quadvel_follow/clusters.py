@@ -1,4 +1,8 @@
-"""Segmentation of a laser scan into clusters, and their features for the leg classifier."""
+"""Segmentation of a laser scan into clusters, and their features for the leg classifier.
+
+`leg_detector` classifies the clusters. Points and ranges are in the frame of the sensor, m; angles
+in rad from its x axis.
+"""
 
 from __future__ import annotations
 

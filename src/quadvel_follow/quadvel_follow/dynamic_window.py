@@ -1,4 +1,8 @@
-"""Dynamic window approach: search over constant velocities that can be reached soon.
+"""Dynamic window approach: search for the velocity targets of the next steps with the lowest cost.
+
+Candidates are constant velocities near the present command, the previous result, and guesses of the
+caller. `follow_costs` computes the cost, `rollouts` predicts the motion and has the limits.
+Velocities are in the body frame: vx, vy in m/s, wz in rad/s.
 
 D. Fox, W. Burgard, S. Thrun, The dynamic window approach to collision avoidance, IEEE Robotics and
 Automation Magazine, 1997.
@@ -16,8 +20,8 @@ from .rollouts import STEP_S, STEPS, Limits
 
 COARSE_WINDOW = np.array([1.0, 0.4, 1.2])  # half size: m/s, m/s, rad/s around the command
 FINE_WINDOW = 0.25 * COARSE_WINDOW
-GRID_COUNTS = (5, 3, 7)
-SWITCHING_COST = 0.03  # by which a candidate must be better than the previous result
+GRID_COUNTS = (5, 3, 7)  # candidates in vx, vy, wz
+SWITCHING_COST = 0.03  # cost by which a candidate must be better than the previous result
 
 
 class DynamicWindow:
@@ -39,14 +43,14 @@ class DynamicWindow:
         """Find the targets with the lowest cost.
 
         Args:
-            cost: Returns the cost (K,) of targets (K, STEPS, 3).
+            cost: Returns the cost (K,) of targets (K, STEPS, 3), lower is better.
             limits: Limits of the commands.
             command: Present command, (3,): vx, vy in m/s, wz in rad/s.
-            guesses: Further candidates, (n, STEPS, 3).
+            guesses: Further candidates, (n, STEPS, 3), in the same units.
             elapsed: Time since the previous search, s.
 
         Returns:
-            Targets, (STEPS, 3): vx, vy in m/s, wz in rad/s.
+            Targets, (STEPS, 3), one per step of STEP_S: vx, vy in m/s, wz in rad/s.
         """
         later = elapsed / STEP_S + np.arange(STEPS)
         last = np.column_stack([np.interp(later, np.arange(STEPS), axis) for axis in self._last.T])

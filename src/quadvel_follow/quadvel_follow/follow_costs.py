@@ -1,4 +1,7 @@
-"""Cost of rollouts of a robot that follows a person. No ROS, no search."""
+"""Cost of rollouts of a robot that follows a person. No ROS, no search.
+
+`rollouts` predicts the motions and `dynamic_window` searches for the cheapest one.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +27,7 @@ CHANGE_WEIGHTS = np.array([3.0, 10.0, 15.0])
 EFFORT_WEIGHTS = np.array([0.0, 2.0, 0.3])
 """Weights of squared vx, vy (m/s), wz (rad/s)."""
 COLLISION_COST = 1000.0
+"""Cost of a rollout that collides; it outweighs all other costs."""
 CLOSENESS_WEIGHT = 100.0
 """Weight (1/m^2) of the squared violation of the margin to a person."""
 FOLLOWED_MARGIN_M, PEDESTRIAN_MARGIN_M = 0.5, 0.7

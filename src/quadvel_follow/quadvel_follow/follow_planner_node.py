@@ -1,4 +1,11 @@
-"""ROS node `follow_planner`: scan, odom and people in, velocity cmd_vel_follow out."""
+"""ROS node `follow_planner`: scan, odom and people in, velocity cmd_vel_follow out.
+
+Only messages, diagnostics and parameters are handled here. `follow_planner` plans; `person_tracker`
+finds the people; the command mux passes `cmd_vel_follow` on to the controller.
+
+Units: m, rad, s. Poses and positions of people are in the odometry frame; the velocity that is
+published, and the measured one, are in the body frame.
+"""
 
 from __future__ import annotations
 
@@ -49,6 +56,7 @@ class FollowPlannerNode(Node):
         self.create_timer(1.0, self._report)
 
     def _now(self) -> float:
+        """Return the time of the node's clock, s."""
         return float(1e-9 * self.get_clock().now().nanoseconds)
 
     def _on_scan(self, message: Any) -> None:
@@ -73,7 +81,7 @@ class FollowPlannerNode(Node):
         self._frame = message.header.frame_id
 
     def _on_person(self, message: Any) -> None:
-        """Receive the followed person; its velocity is in the person's own frame."""
+        """Receive the followed person; its velocity is in the person's own frame, x ahead."""
         try:
             x, y, yaw = planar_pose(message.pose.pose)
             ahead, left, _ = planar_twist(message.twist.twist)
@@ -85,6 +93,7 @@ class FollowPlannerNode(Node):
             self._refusals.add("person/odometry", MessageError(str(error)))
 
     def _on_persons(self, message: Any) -> None:
+        """Receive all people, the followed one included; positions and velocities are planar."""
         try:
             persons = [(one.x, one.y, one.vx, one.vy) for one in message.persons]
             self._planner.on_others(self._now(), seconds(message.header.stamp), persons)
@@ -92,9 +101,11 @@ class FollowPlannerNode(Node):
             self._refusals.add("persons", MessageError(str(error)))
 
     def _on_robot(self, message: Any) -> None:
+        """Receive the reason why the controller would refuse to walk now; empty if it would walk."""
         self._planner.on_robot(self._now(), message.walk_refusal)
 
     def _step(self) -> None:
+        """Plan, and publish velocity, state and path."""
         self._plan = plan = self._planner.step(self._now())
         twist = Twist()
         twist.linear.x, twist.linear.y, twist.angular.z = plan.velocity.tolist()
@@ -107,6 +118,7 @@ class FollowPlannerNode(Node):
         self._way.publish(self._path(plan))
 
     def _path(self, plan: Plan) -> Any:
+        """Convert the planned poses to a path message in the frame of odom."""
         message = Path()
         message.header.stamp, message.header.frame_id = self.get_clock().now().to_msg(), self._frame
         for x, y, yaw in plan.path.tolist():

@@ -18,7 +18,7 @@ SIDE_OFFSETS_M = np.array([-0.15, -0.075, 0.0, 0.075, 0.15])
 PLACE_DEPTH_M = 0.25
 """Distance before and behind a place within which a reading belongs to it."""
 MEMORY_S = 1.6
-"""Time for which scans are kept."""
+"""Time for which scans are kept, s."""
 KEEP_PERIOD_S = 0.15
 """Smallest time between two kept scans."""
 MIN_AGE_S = 0.45
@@ -91,7 +91,7 @@ class ScanHistory:
         Args:
             time: Time of the scan, s.
             scan: The scan.
-            pose: Pose of the sensor, (3,).
+            pose: Pose of the sensor at that time, (3,): x, y in m, yaw in rad.
         """
         while self._kept and time - self._kept[0][0] > MEMORY_S:
             self._kept.popleft()
@@ -107,7 +107,7 @@ class ScanHistory:
         Args:
             time: Present time, s.
             points: Places, (n, 2), m, in the frame of the poses.
-            pose: Present pose of the sensor, (3,).
+            pose: Present pose of the sensor, (3,): x, y in m, yaw in rad.
 
         Returns:
             Number of scans with an empty place, (n,), and with an occupied place, (n,).

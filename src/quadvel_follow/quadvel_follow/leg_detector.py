@@ -1,4 +1,8 @@
-"""Leg detector for laser scans: clusters and a small network that classifies them."""
+"""Leg detector for laser scans: clusters and a small network that classifies them.
+
+`clusters` segments the scan; `quadvel_training.leg_classifier` trains the network; `person_tracker`
+joins legs to people over time.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Obstacle map in the odometry frame for objects out of view; people are excluded."""
+"""Obstacle map in the odometry frame for objects out of view; people are excluded.
+
+`free_space` judges what a scan shows about a place; `clearance` computes distances to the points.
+"""
 
 from __future__ import annotations
 

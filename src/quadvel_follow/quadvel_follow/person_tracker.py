@@ -108,10 +108,10 @@ def deviation(covariance: Array) -> float:
     """Compute the largest standard deviation in any direction.
 
     Args:
-        covariance: Covariance, (2, 2).
+        covariance: Covariance of a position, (2, 2), m^2.
 
     Returns:
-        Square root of its largest eigenvalue.
+        Square root of its largest eigenvalue, m.
     """
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
@@ -124,7 +124,7 @@ class Track:
         id: Identity; does not change.
         position: Position in the tracking frame, (2,), m.
         velocity: Velocity, (2,), m/s.
-        covariance: Covariance of x, y, vx, vy, (4, 4).
+        covariance: Covariance of x, y (m), vx, vy (m/s), (4, 4).
         age: Time since it was first seen, s.
         seen: Time of the last scan with one of its legs, s.
         confirmed: Whether it is a person.

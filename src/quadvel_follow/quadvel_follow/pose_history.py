@@ -1,4 +1,7 @@
-"""Interpolated poses of robot and sensor from recent odometry."""
+"""Interpolated poses of robot and sensor from recent odometry.
+
+It keeps the last seconds only. Poses are x, y in m and yaw in rad, in the odometry frame.
+"""
 
 from __future__ import annotations
 

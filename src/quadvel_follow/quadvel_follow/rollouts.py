@@ -1,4 +1,8 @@
-"""Prediction of the robot's motion under velocity commands: limits, first-order lag, and poses."""
+"""Prediction of the robot's motion under velocity commands: limits, first-order lag, and poses.
+
+`dynamic_window` searches the commands and `follow_costs` rates the rollouts. Velocities are in the
+body frame, poses in the frame of the given pose (odometry).
+"""
 
 from __future__ import annotations
 
@@ -11,9 +15,11 @@ from quadvel_description.arrays import Array
 Axes = tuple[float, float, float]
 
 STEP_S = 0.125
+"""Time between two steps of a rollout, s."""
 STEPS = 14
+"""Number of steps of a rollout."""
 LAG_S = 0.2
-"""Time constant from command to velocity: delay and first-order lag together."""
+"""Time constant from command to velocity, s: delay and first-order lag together."""
 
 
 @attrs.frozen
@@ -21,7 +27,7 @@ class Limits:
     """Limits of the commands vx, vy (m/s), wz (rad/s).
 
     Attributes:
-        velocity: Largest magnitudes; vx and vy are limited by an ellipse.
+        velocity: Largest |vx|, |vy| (m/s) and |wz| (rad/s); an ellipse limits vx and vy together.
         backward: Largest backward speed, m/s.
         curve: Largest |wz| (|vx| + |vy|), m/s^2.
         acceleration: Largest rates of change away from zero, m/s^2, m/s^2, rad/s^2.
@@ -38,7 +44,7 @@ class Limits:
         """Clip commands to the limits of velocity.
 
         Args:
-            commands: Commands, (..., 3).
+            commands: Commands, (..., 3): vx, vy in m/s, wz in rad/s.
 
         Returns:
             Clipped commands, (..., 3).
@@ -55,8 +61,8 @@ class Limits:
         """Move commands toward targets within the limits of acceleration.
 
         Args:
-            before: Present commands, (..., 3).
-            target: Targets, (..., 3).
+            before: Present commands, (..., 3): vx, vy in m/s, wz in rad/s.
+            target: Targets, (..., 3), in the same units.
             seconds: Time, s.
 
         Returns:
@@ -73,8 +79,8 @@ class Rollouts:
 
     Attributes:
         commands: Commands, (K, STEPS, 3): vx, vy in m/s, wz in rad/s, body frame.
-        velocity: Velocities of the robot, as `commands`.
-        poses: Poses, (K, STEPS, 3): x, y in m, yaw in rad.
+        velocity: Predicted velocities of the robot, shape, units and frame as `commands`.
+        poses: Poses at `TIMES_S`, (K, STEPS, 3): x, y in m, yaw in rad.
     """
 
     commands: Array
@@ -91,7 +97,7 @@ _RESPONSE = np.where(
 )  # (STEPS, STEPS)
 _INITIAL_DECAY = _DECAY ** np.arange(1, STEPS + 1)
 TIMES_S = STEP_S * np.arange(1, STEPS + 1)
-"""Times of the poses, (STEPS,)."""
+"""Times of the poses from now, (STEPS,), s."""
 
 
 def roll_out(targets: Array, pose: Array, velocity: Array, command: Array, limits: Limits) -> Rollouts:
@@ -99,9 +105,9 @@ def roll_out(targets: Array, pose: Array, velocity: Array, command: Array, limit
 
     Args:
         targets: Targets, (K, STEPS, 3): vx, vy in m/s, wz in rad/s.
-        pose: Present pose, (3,).
-        velocity: Present velocity, (3,).
-        command: Present command, (3,).
+        pose: Present pose, (3,): x, y in m, yaw in rad.
+        velocity: Present velocity, (3,): vx, vy in m/s, wz in rad/s, body frame.
+        command: Present command, (3,), in the same units and frame.
         limits: Limits of the commands.
 
     Returns:

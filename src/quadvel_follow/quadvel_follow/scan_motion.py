@@ -27,6 +27,7 @@ MAX_TURN_RAD = 0.6
 MAX_POINTS = 240
 """Largest number of matched readings."""
 ITERATIONS = 12
+"""Number of matching and alignment steps for one scan."""
 MATCH_DISTANCES_M = (1.0, 0.15)
 """Largest distance of matched points in the first and in the last iteration."""
 

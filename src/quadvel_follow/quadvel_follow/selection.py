@@ -1,4 +1,7 @@
-"""Selection of the followed person among the tracks, and its re-identification after a loss."""
+"""Selection of the followed person among the tracks, and its re-identification after a loss.
+
+`person_tracker` makes the tracks; the planner follows the selected one.
+"""
 
 from __future__ import annotations
 

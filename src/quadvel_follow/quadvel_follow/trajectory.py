@@ -1,4 +1,7 @@
-"""Trajectories from files and their execution in open or closed loop. No ROS."""
+"""Trajectories from files and their execution in open or closed loop. No ROS.
+
+`trajectory_planner` is the ROS node around it. Units: m, rad, s; velocities are in the body frame.
+"""
 
 from __future__ import annotations
 

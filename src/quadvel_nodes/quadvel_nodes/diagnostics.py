@@ -21,7 +21,7 @@ def diagnostics(
         stamp: Time of the report, a builtin_interfaces/Time.
         name: Name of the node.
         level: A level constant of DiagnosticStatus.
-        summary: One sentence that tells an operator what to do.
+        summary: One sentence that states the problem and what the operator can do.
         values: Values by name; each is converted with `str`.
 
     Returns:

@@ -72,7 +72,7 @@ def encode_low_state(stamp: Stamp, state: RobotState) -> bytes:
     """Convert a RobotState to a LowState.
 
     Args:
-        stamp: Time of the state.
+        stamp: Time of the state, (s, ns).
         state: The state.
 
     Returns:
@@ -106,7 +106,7 @@ def encode_low_cmd(stamp: Stamp, command: JointCommand) -> bytes:
     """Convert a JointCommand to a LowCmd.
 
     Args:
-        stamp: Present time.
+        stamp: Present time, (s, ns).
         command: The joint command.
 
     Returns:
@@ -123,11 +123,11 @@ def encode_estimate(
     """Write a velocity estimate, a geometry_msgs/TwistWithCovarianceStamped.
 
     Args:
-        stamp: Time of the estimate.
+        stamp: Time of the estimate, (s, ns).
         frame: Frame of the velocities.
         linear: Linear velocity, (3,), m/s.
         angular: Angular velocity, (3,), rad/s.
-        covariance: Covariance, (36,): x, y, z and the rotations about them.
+        covariance: Covariance, (36,): velocities along x, y, z (m/s) and rates about them (rad/s).
 
     Returns:
         The message in CDR.

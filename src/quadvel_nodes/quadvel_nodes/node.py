@@ -1,4 +1,7 @@
-"""Parameters, start and shutdown of a node. For node files only: this module needs rclpy."""
+"""Parameters, start and shutdown of a node. For node files only: this module needs rclpy.
+
+Nodes report with `diagnostics` and convert messages with `messages`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Selection of the samples of a stream that a periodic loop answers."""
+"""Selection of the samples of a stream that a periodic loop answers.
+
+`quadvel_estimator.tracker` and `quadvel_policy.control_loop` ask it which samples to use.
+"""
 
 from __future__ import annotations
 

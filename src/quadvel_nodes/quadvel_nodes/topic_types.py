@@ -1,4 +1,7 @@
-"""Detection of publishers whose type differs from the subscriptions. For node files."""
+"""Detection of publishers whose type differs from the subscriptions. For node files.
+
+`node` watches the topics of each node with it.
+"""
 
 from __future__ import annotations
 

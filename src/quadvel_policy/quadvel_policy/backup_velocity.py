@@ -1,4 +1,7 @@
-"""Backup velocity that replaces a missing or wrong velocity estimate. Knows no ROS."""
+"""Backup velocity that replaces a missing or wrong velocity estimate. Knows no ROS.
+
+The supervisor selects it when a guard rejects the estimate; `guards.velocity` holds those checks.
+"""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ LIMITS = {
 
 @attrs.frozen(kw_only=True)
 class JointCommandLimits:
-    """Limits on joint commands besides those of the robot; each field is a node parameter."""
+    """Limits on joint commands, in addition to the robot's; each field is a node parameter."""
 
     max_torque_step: float = positive(
         30.0, "largest change of a joint's torque from tick to tick, N m", at_most=2.0 * MAX_TORQUE_NM
@@ -115,7 +115,8 @@ def _add_torque(robot: Robot, command: JointCommand, change: Array) -> None:
 
         q_des' = clamp(q_des + change / kp),   tau_ff' = tau_ff + change - kp (q_des' - q_des)
 
-    The target changes as far as stiffness and range allow; feed-forward torque gives the rest.
+    The target takes as much of the change as stiffness and range allow; feed-forward torque the
+    rest.
     """
     shift = np.divide(change, command.kp, out=np.zeros(12), where=command.kp > 0.0)
     q = np.where(shift == 0.0, command.q, clip_to_command_range(robot, command.q + shift))

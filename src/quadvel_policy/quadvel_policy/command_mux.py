@@ -51,10 +51,10 @@ class MuxConfig:
     """Limits of the command, each for vx, vy (m/s) and wz (rad/s).
 
     Attributes:
-        max_velocity: Largest velocity.
+        max_velocity: Largest |vx|, |vy| (m/s) and |wz| (rad/s).
         acceleration: Largest rate of change away from zero, m/s^2 and rad/s^2.
         stop_acceleration: Largest rate of change towards zero, m/s^2 and rad/s^2.
-        dead_zone: Velocity that counts as zero if all axes are below it.
+        dead_zone: |vx|, |vy| (m/s), |wz| (rad/s); a command below all three counts as zero.
     """
 
     max_velocity: Axes = _axes((4.5, 2.2, 6.3), "largest vx, vy, wz passed on, m/s, rad/s")

@@ -1,4 +1,8 @@
-"""Parameters of the supervisor and of its parts. Knows no ROS."""
+"""Parameters of the supervisor and of its parts. Knows no ROS.
+
+`supervisor`, `control_loop` and `transitions` use it; `guard.GuardConfig` has the limits of the
+guards.
+"""
 
 from __future__ import annotations
 

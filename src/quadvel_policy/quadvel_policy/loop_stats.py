@@ -54,7 +54,7 @@ class LoopSummary:
     """Statistics of the loop, in the units of quadvel_msgs/ControllerState.
 
     Attributes:
-        rate_hz: Ticks in the last second.
+        rate_hz: Rate of the ticks in the last second, Hz.
         period_p99_ms: 99th percentile of the time between ticks, ms.
         inference_p50_us: Median duration of the network, us.
         compute_p50_us: Median duration of a tick, us.

@@ -150,7 +150,7 @@ class Damping:
 
 
 def vertical_offset(state: RobotState) -> Array:
-    """Compute how far the vertical through the trunk's origin is off the trunk's own axis, 1 m below the origin.
+    """Compute the offset of the vertical from the trunk's own z axis, 1 m below the trunk's origin.
 
     Args:
         state: The measured state.

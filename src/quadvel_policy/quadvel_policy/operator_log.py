@@ -1,4 +1,7 @@
-"""Log of the supervisor for the operator: one sentence for each change. Knows no ROS."""
+"""Log of the supervisor for the operator: one sentence for each change. Knows no ROS.
+
+The controller node writes the lines to the ROS log; the reasons come from the supervisor.
+"""
 
 from __future__ import annotations
 

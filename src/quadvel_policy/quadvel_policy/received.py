@@ -1,4 +1,7 @@
-"""Validation of received velocities and time stamps."""
+"""Validation of received velocities and time stamps.
+
+`command_mux` and `control_loop` act on values that passed these checks.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Parameters of the nodes `sim_node` and `board`. No ROS."""
+"""Parameters of the nodes `sim_node` and `board`. No ROS.
+
+`sim_node`, `board_node` and `simulation_node` declare and use them.
+"""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ class Physics:
         torsional_friction: Torsional friction coefficient of the feet, m: a turning foot is braked
             with this times its load; 0: none.
         inertia: Factor of the inertia of every link.
-        mass: Factor of the mass of every link.
+        mass: Factor of the mass of every link, without unit; 1 is the robot as described.
     """
 
     substeps: int = field(1, at_least=0, whole=True)

@@ -1,4 +1,8 @@
-"""Dynamics of a world in a simulation: walking people, laser scans and touch counts."""
+"""Dynamics of a world in a simulation: walking people, laser scans and touch counts.
+
+`world_parts` builds the geoms, `persons` moves the people, `laser` casts the rays, and `world_view`
+publishes the results. It acts on the model of the `Simulator` that owns it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Gait model of a person for a laser at shin height: two circles that swing alternately."""
+"""Gait model of a person for a laser at shin height: two circles that swing alternately.
+
+It moves one person without physics; `persons` moves the bodies of a MuJoCo model by it. Positions
+are in the world frame, m.
+"""
 
 from __future__ import annotations
 

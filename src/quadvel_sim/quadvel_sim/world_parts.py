@@ -1,4 +1,8 @@
-"""Parts of a world: walls, boxes, trees, tables, patches, hills, people. Each adds its own geoms."""
+"""Parts of a world: walls, boxes, trees, tables, patches, hills, people. Each adds its own geoms.
+
+`world` reads the list of parts from a file, and `persons` moves the people. Positions are in the
+world frame, m; yaw in a file is in degrees.
+"""
 
 from __future__ import annotations
 
@@ -97,7 +101,7 @@ class Wall:
         Args:
             spec: Model that is extended.
             name: Name of the geom or its prefix.
-            height: Height of the ground.
+            height: Function from x, y (m) to the height of the ground, m.
         """
         for k, (begin, end) in enumerate(itertools.pairwise(self.points)):
             centre, side = 0.5 * (begin + end), end - begin
@@ -127,7 +131,7 @@ class Box:
         Args:
             spec: Model that is extended.
             name: Name of the geom.
-            height: Height of the ground.
+            height: Function from x, y (m) to the height of the ground, m.
         """
         yaw = np.radians(self.yaw)
         _add_upright(spec, name, _BOX, self.position, self.size, yaw, _RGBA["box"], height)
@@ -153,7 +157,7 @@ class Trees:
         Args:
             spec: Model that is extended.
             name: Prefix of the geom names.
-            height: Height of the ground.
+            height: Function from x, y (m) to the height of the ground, m.
         """
         size = [self.radius, self.radius, self.height]
         for k, position in enumerate(self.positions):
@@ -182,7 +186,7 @@ class Table:
         Args:
             spec: Model that is extended.
             name: Name of the board, prefix of the legs' names.
-            height: Height of the ground.
+            height: Function from x, y (m) to the height of the ground, m.
         """
         yaw = np.radians(self.yaw)
         for k, corner in enumerate(self.legs):

@@ -1,4 +1,7 @@
-"""ROS topics of a world: laser scans, mounting of the laser, true positions of people."""
+"""ROS topics of a world: laser scans, mounting of the laser, true positions of people.
+
+`surroundings` computes what is published here.
+"""
 
 from __future__ import annotations
 

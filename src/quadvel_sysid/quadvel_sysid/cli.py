@@ -1,4 +1,7 @@
-"""The command `quadvel identify`, also `ros2 run quadvel_sysid identify`: logs in, report out."""
+"""The command `quadvel identify`, also `ros2 run quadvel_sysid identify`: logs in, report out.
+
+It only parses options and prints; `identify` is the function behind it.
+"""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ Result = TypeVar("Result")
 PR_SET_PDEATHSIG = 1
 INTERRUPT_SIGNALS = {signal.SIGINT}
 _MAX_TASKS = 2048
-"""Maximum number of tasks: a pipe of one page holds so many 2-byte numbers."""
+"""Maximum number of tasks: a pipe of one page (4096 bytes) holds this many 2-byte numbers."""
 
 
 def parallel_map(work: Callable[[int], Result], count: int, cores: int, shared: object) -> list[Result]:

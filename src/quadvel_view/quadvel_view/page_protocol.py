@@ -1,4 +1,7 @@
-"""Schema of the messages that a page sends to `/words`, one record per order."""
+"""Schema of the messages that a page sends to `/words`, one record per order.
+
+`server` receives the messages; `view_node` and `replay` execute the orders.
+"""
 
 from __future__ import annotations
 

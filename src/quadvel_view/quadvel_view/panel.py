@@ -1,4 +1,7 @@
-"""Readings of the page as JSON, from a picture and the operator's state."""
+"""Readings of the page as JSON, from a picture and the operator's state.
+
+`picture` holds the state, and `viewer` sends the readings to the page.
+"""
 
 from __future__ import annotations
 

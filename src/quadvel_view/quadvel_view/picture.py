@@ -1,4 +1,7 @@
-"""State of a robot as known from its topics, live or recorded. No ROS, no drawing."""
+"""State of a robot as known from its topics, live or recorded. No ROS, no drawing.
+
+`scene` draws it, `panel` turns it into readings, and `view_node` or `playback` fills it.
+"""
 
 from __future__ import annotations
 
@@ -130,7 +133,7 @@ class RobotPicture:
         position: (3,) m, base in the frame odom.
         quaternion: (4,) w, x, y, z, base in the frame odom.
         measured: (3,) vx, vy (m/s), wz (rad/s), body frame.
-        commanded: (3,) velocity command in effect, as `measured`.
+        commanded: (3,) vx, vy (m/s), wz (rad/s) of the command in effect, body frame.
         source: Selected input of the command mux.
         state: The newest controller/state, or None.
         nodes: Diagnostics by node.

@@ -1,4 +1,7 @@
-"""Playback of a recording: play, pause, speed, and the picture at any time. No ROS, no page."""
+"""Playback of a recording: play, pause, speed, and the picture at any time. No ROS, no page.
+
+`replay` connects it to the page, and `picture` keeps the state of the robot.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Recordings started from the page: `quadvel record` in a separate process."""
+"""Recordings started from the page: `quadvel record` in a separate process.
+
+`quadvel_bringup.record` is what the process runs; `view_node` starts and stops it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Replay of a recording on the operator page, without ROS."""
+"""Replay of a recording on the operator page, without ROS.
+
+It connects `playback` (the state at a time) to `viewer` (the page). `view_node` shows a live robot.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,9 @@ def replay(
 ) -> None:
     """Serve the page and play the recording while a page is open.
 
+    Errors of what it uses pass through: RecordingError, OSError, and AddressError if the address
+    is unavailable.
+
     Args:
         path: A recording of a robot.
         robot: Name or file of the robot; None for the one that the recording names.
@@ -30,14 +36,14 @@ def replay(
         port: TCP port, 0 for a free one.
         is_over: Waits for the given time (s) and returns whether to end.
         announce: Receives the address of the page.
-
-        Errors pass through: RecordingError, OSError, and AddressError if the address is
-        unavailable.
     """
     playback = Playback(path, robot)
-    words: SimpleQueue[PageMessage] = SimpleQueue()
-    viewer = Viewer(playback.picture.robot, host, port, lambda page, word: words.put(word), lambda page: None)
-    idle = Operator()
+    # The web server's thread fills the queue; this thread executes the orders between two frames.
+    orders: SimpleQueue[PageMessage] = SimpleQueue()
+    viewer = Viewer(
+        playback.picture.robot, host, port, lambda page, order: orders.put(order), lambda page: None
+    )
+    idle = Operator()  # the page needs one; nobody drives a recorded robot
     try:
         announce(viewer.url)
         then = time.monotonic()
@@ -46,8 +52,8 @@ def replay(
             if viewer.is_watched:
                 playback.advance(now - then)
             then = now
-            while (word := _next_or_none(words)) is not None:
-                execute(playback, word)
+            while (order := _next_or_none(orders)) is not None:
+                execute(playback, order)
             viewer.show(
                 playback.picture,
                 idle,
@@ -77,9 +83,9 @@ def execute(playback: Playback, word: PageMessage) -> None:
             playback.set_pace(pace)
 
 
-def _next_or_none(words: SimpleQueue[PageMessage]) -> PageMessage | None:
+def _next_or_none(orders: SimpleQueue[PageMessage]) -> PageMessage | None:
     """Return the next queued order, or None."""
     try:
-        return words.get_nowait()
+        return orders.get_nowait()
     except Empty:
         return None

@@ -1,4 +1,8 @@
-"""The complete page: scene, web server and readings. The caller supplies the picture."""
+"""The complete operator page: the 3-D scene, the web server, and the readings next to the scene.
+
+The caller supplies the state of the robot as a `RobotPicture`: `view_node` from live topics,
+`replay` from a recording. `panel` computes the readings, that is the numbers and texts of the page.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,7 @@ MAX_PORT = 65535
 
 
 class Viewer:
-    """Serves the page from construction until `close`.
+    """Serves the page from construction until `close`; `url` is its address.
 
     Args:
         robot: The robot.
@@ -67,9 +71,9 @@ class Viewer:
 
         Args:
             picture: The state of the robot.
-            operator: Hold and STOP.
-            now: s, on the clock of the picture.
-            more: Further readings.
+            operator: Velocity that the operator holds, and whether STOP is latched.
+            now: Time, s, on the clock of the picture.
+            more: Further readings by name, such as `recording`; values must be valid in JSON.
         """
         self._scene.draw(picture)
         self._page.send_to_pages({**panel(picture, operator, now), **more})

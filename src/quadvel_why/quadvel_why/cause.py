@@ -59,7 +59,8 @@ class Measurement:
         traces: For the picture.
         alternatives: Names of causes that look the same in this recording, each with the experiment that sets them
             apart.
-        limit: Limit that comes from the training of the policy, instead of healthy walks.
+        limit: Limit from the training of the policy, in the unit of the cause; None: that of
+            healthy walks.
     """
 
     value: float
@@ -79,7 +80,7 @@ class Cause:
     Attributes:
         link: Part of the chain to which it belongs.
         unit: Unit of the measured number.
-        least: Smallest number that is worth naming; the limit is at least that.
+        least: Smallest number that is worth naming, in `unit`; no limit is lower.
         needs: Parts of a recording without which the cause cannot be examined, keys of `signals.PARTS`.
         remedy: What to do.
     """

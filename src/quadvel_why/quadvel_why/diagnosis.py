@@ -1,4 +1,7 @@
-"""Walks the chain: examines all causes in order and names the first one that is found. Writes nothing."""
+"""Examines all causes in the order of the chain and names the first one that is found.
+
+`links` holds the causes and `report` writes the result.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Finds what would make the policy give the recorded actions: the search over variants of `policy_replay`."""
+"""Searches the change of the policy's inputs or outputs under which it gives the recorded actions.
+
+Each change is a `Variant`, which `policy_replay` replays. `links.contract` turns the result into
+causes. All errors are root mean squares of recorded minus replayed joint targets, rad.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +18,20 @@ from quadvel_description.network_input import InputLayout
 from .policy_replay import Observe, PolicyReplay, Replay, Variant, term_slice
 
 AGREES_RAD = 0.02
-"""Targets that differ by less are the policy's; the velocity of another tick makes a quarter of that."""
+"""Largest error of targets that count as the policy's own.
+
+An observation with the velocity of a neighbouring tick causes a quarter of this.
+"""
 REPAIRED_SHARE = 0.35
-"""A hypothesis has to leave less than this share of the difference."""
+"""Share of the error of the unchanged policy that an accepted variant may leave."""
 SEARCH_TICKS = 150
+"""Ticks of the walk that each variant replays."""
 RESET_TICKS = (1, 2, 3, 4, 5, 8, 10, 20, 25, 40, 50, 100)
+"""Periods of a regular reset of the memory that are tried, ticks."""
 LATE_TICKS = (1, 2, 4, 8)
+"""Ages of the states that are tried, ticks."""
 SCALES = (0.0, 1.0 / 57.3, 0.1, 0.25, 0.5, 0.7, 1.4, 2.0, 4.0, 10.0, 57.3, -1.0)
+"""Factors on a term of the observation that are tried; 57.3 is degrees instead of radians."""
 REORDERINGS = {
     "left and right legs exchanged": (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8),
     "front and rear legs exchanged": (6, 7, 8, 9, 10, 11, 0, 1, 2, 3, 4, 5),
@@ -30,7 +41,7 @@ REORDERINGS = {
 }
 """Orders of twelve joints that other stacks use, as indices into ours."""
 MEMORY_S = 0.7
-"""Time after which a memory that was not cleared has faded."""
+"""Time from the start of a walk after which the network has forgotten what it held before."""
 
 
 @attrs.frozen(eq=False)
@@ -39,9 +50,10 @@ class Explanation:
 
     Attributes:
         cause: Name of the cause; empty if the actions are the policy's.
-        sentence: What would make them equal.
-        error: Difference of recorded and replayed targets, rad.
-        base: The replay of the policy as its file says.
+        sentence: The variant with which recorded and replayed targets agree best, and its error,
+            rad.
+        error: Error of the unchanged policy, rad.
+        base: Replay of the unchanged policy.
     """
 
     cause: str
@@ -51,7 +63,7 @@ class Explanation:
 
     @property
     def worst_joint(self) -> int:
-        """Joint with the largest difference."""
+        """Index of the joint with the largest error."""
         off = np.where(self.base.valid, self.base.recorded - self.base.expected, 0.0)
         return int(np.argmax((off**2).sum(axis=0)))
 
@@ -74,6 +86,7 @@ _FOUND: WeakKeyDictionary[PolicyReplay, Explanation] = WeakKeyDictionary()
 
 
 def _explain(replay: PolicyReplay) -> Explanation:
+    """Try all variants and return the one that leaves the smallest share of the error."""
     base = replay.base
     error = base.error
     if not error > AGREES_RAD:
@@ -99,7 +112,7 @@ def _explain(replay: PolicyReplay) -> Explanation:
 
 
 def _action_factor(replay: PolicyReplay) -> tuple[float, float]:
-    """Factor of the actions that fits best, and the remaining difference, rad."""
+    """Return the factor of the actions that fits best, and the remaining error, rad."""
     base, offset = replay.base, np.array(replay.policy.metadata.action_offset)
     x, y = (base.expected - offset)[base.valid], (base.recorded - offset)[base.valid]
     factor = float(x @ y / (x @ x))
@@ -107,6 +120,7 @@ def _action_factor(replay: PolicyReplay) -> tuple[float, float]:
 
 
 def _variants(replay: PolicyReplay) -> Iterator[tuple[str, Sequence[Variant]]]:
+    """Yield each cause with the variants that it may have caused."""
     layout = replay.policy.metadata.observation
     resets = [Variant(f"the memory cleared every {n} ticks", reset_every=n) for n in RESET_TICKS]
     yield "memory_reset", resets
@@ -116,7 +130,7 @@ def _variants(replay: PolicyReplay) -> Iterator[tuple[str, Sequence[Variant]]]:
 
 
 def _reorderings(layout: InputLayout) -> Iterator[tuple[str, Observe]]:
-    """Other orders of an observation: joints reordered, and terms of one size exchanged."""
+    """Yield other orders of an observation: joints reordered, and terms of equal size exchanged."""
     twelve = [term.name for term in layout.terms if term.size == 12]
     for name, order in REORDERINGS.items():
         for terms in (("q", "dq"), tuple(twelve)):
@@ -129,6 +143,8 @@ def _reorderings(layout: InputLayout) -> Iterator[tuple[str, Observe]]:
 
 
 def _reordered(terms: Sequence[str], order: Sequence[int]) -> Observe:
+    """Return the change that reorders the numbers of each named term."""
+
     def change(x: NDArray[np.float32], layout: InputLayout) -> NDArray[np.float32]:
         for name in terms:
             place = term_slice(layout, name)
@@ -139,6 +155,8 @@ def _reordered(terms: Sequence[str], order: Sequence[int]) -> Observe:
 
 
 def _exchanged(first: str, second: str) -> Observe:
+    """Return the change that exchanges two terms of equal size."""
+
     def change(x: NDArray[np.float32], layout: InputLayout) -> NDArray[np.float32]:
         a, b = term_slice(layout, first), term_slice(layout, second)
         x[a], x[b] = x[b].copy(), x[a].copy()
@@ -148,6 +166,8 @@ def _exchanged(first: str, second: str) -> Observe:
 
 
 def _scaled(name: str, factor: float) -> Observe:
+    """Return the change that multiplies a term by a factor."""
+
     def change(x: NDArray[np.float32], layout: InputLayout) -> NDArray[np.float32]:
         x[term_slice(layout, name)] *= factor
         return x
@@ -156,7 +176,7 @@ def _scaled(name: str, factor: float) -> Observe:
 
 
 def _refined_scale(replay: PolicyReplay) -> tuple[str, float, float]:
-    """Term and factor of its scale that fit best, and the difference that they leave, rad."""
+    """Return the term and the factor on it that fit best, and the error that they leave, rad."""
     layout = replay.policy.metadata.observation
 
     def left(name: str, factor: float) -> float:

@@ -27,9 +27,11 @@ CLEAR_VELOCITY_M_S, CLEAR_HEIGHT_M = 0.15, 0.04
 EXCHANGE, EXCHANGED_SIDES = "left and right legs exchanged", -0.3
 """Correlation of roll moment and roll below which the sides are exchanged; healthy walks show 0.3 to 0.7."""
 MIN_IMPROVEMENT = 0.4
-"""Another convention has to leave less than this share of the contradiction."""
+"""Share of the contradiction that an accepted convention may leave."""
 MIN_PAIR_ROWS = 40
+"""Fewest rows with two planted feet that give a contradiction."""
 OFFSET_ROUNDS = 8
+"""Iterations of the fit of an offset."""
 
 
 @attrs.frozen(eq=False)
@@ -89,7 +91,7 @@ class Tried:
 
     @property
     def text(self) -> str:
-        """The disagreement, for people."""
+        """One sentence about the disagreement of planted legs: velocity in m/s, height in mm."""
         return (
             f"{self.legs.disagreement:.2f} m/s and {1e3 * self.legs.unevenness:.0f} mm between planted legs"
         )
@@ -132,12 +134,12 @@ class OffsetFit:
     Attributes:
         joint: Index of the joint.
         offset: Offset of the recorded angle, rad.
-        size: Its magnitude as far as it is certain, rad.
+        size: Magnitude of the offset that is certain, rad.
         before: Robust standard deviation of the heights from a plane, m.
-        after: The same with the offset.
+        after: The same after the offset is removed, m.
         time: Times of the heights, (k,), s.
         measured: Heights between pairs of feet, (k,), m.
-        expected: The same of the plane, (k,), m.
+        expected: Heights between the same pairs on one plane, (k,), m.
     """
 
     joint: int

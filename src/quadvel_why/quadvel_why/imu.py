@@ -115,13 +115,13 @@ class ImuHypotheses:
         return min(tried, key=lambda hypothesis: hypothesis.error)
 
     def turns(self, quaternion: str) -> Array:
-        """Return the turns over windows of m states, (n - m, 3), rad, body frame.
+        """Return the turns of the trunk over windows of m states.
 
         Args:
             quaternion: Key of QUATERNIONS.
 
         Returns:
-            Rotation vectors.
+            Rotation vectors, (n - m, 3), rad, body frame.
         """
         if quaternion not in self._turns:
             self._turns[quaternion] = self._compute_turns(quaternion)
@@ -138,13 +138,13 @@ class ImuHypotheses:
         return np.asarray(vector * (angle / np.maximum(length, 1e-12))[:, None])
 
     def integrals(self, gyroscope: str) -> Array:
-        """Return the integrals of the gyroscope over the same windows, (n - m, 3), rad.
+        """Integrate the gyroscope over the windows of `turns`.
 
         Args:
             gyroscope: Key of GYROSCOPES, or IN_WORLD.
 
         Returns:
-            Rotation vectors.
+            Rotation vectors, (n - m, 3), rad, body frame.
         """
         w = self._imu.angular_velocity
         rates = (

@@ -23,11 +23,11 @@ from quadvel_estimator.odometry import leg_velocity
 from .run import Run
 
 PLANTED_N = 40.0
-"""A foot that pushes with more stands."""
+"""Force on the ground, N, above which a foot counts as planted."""
 MIN_PUSH_N = 10.0
 BALANCE_WINDOW_S, MIN_BALANCE_ROWS = 0.05, 60
 DAMPING_M2 = 1e-4
-"""Of the least squares of the forces, near a straight leg."""
+"""Damping (m^2) of the least squares for the foot forces; it bounds them near a straight leg."""
 PAIRS = tuple(combinations(range(4), 2))
 
 

@@ -26,14 +26,16 @@ from .run import SAME_INSTANT_S, Run
 Observe = Callable[[NDArray[np.float32], InputLayout], NDArray[np.float32]]
 """Changes a finished observation."""
 MAX_FEED_FORWARD_NM = 1e-3
-"""Torques beside the target mean that the limits of joint commands acted: the target says no action then.
+"""Feed-forward torque, N m, above which the joint-command limits acted.
 
-So do torques near a limit.
+A target is then not the action of the policy; neither is one with a torque near its limit.
 """
 NEAR_LIMIT = 0.98
+"""Share of a limit from which it may have changed the target."""
 BEFORE_FAULT_S = 0.25
-"""Before a fault, guards may already replace velocity and command."""
+"""Time before a fault, s, in which guards may already replace velocity and command."""
 MIN_TICKS = 20
+"""Fewest ticks that give an error."""
 MODE_REPORT_PERIOD_S = 0.05
 """Longest time from the start of a walk to the first report of it."""
 
@@ -61,7 +63,7 @@ class Variant:
         name: What it did, for people.
         observe: Change of the observation; None: none.
         reset_every: Ticks after which it cleared the memory; 0: never.
-        late: Ticks by which the states that it used were older.
+        late: Age of the states that it used, ticks; 0: the newest.
     """
 
     name: str
@@ -125,7 +127,7 @@ class PolicyReplay:
         return len(self.ticks) >= MIN_TICKS and self._run.estimate is not None and self._run.imu is not None
 
     def _policy_ticks(self) -> Indices:
-        """Commands of the first walk that are no repetitions of the one before."""
+        """Return the rows of the first walk's commands that differ from the command before."""
         run, commands = self._run, self._run.commands
         if run.modes is None or run.imu is None:
             return np.zeros(0, int)
@@ -175,7 +177,7 @@ class PolicyReplay:
         )
 
     def _made_to_stand(self, times: Array) -> Bools:
-        """Whether the controller reported before and after each time that it stands, whatever was commanded."""
+        """Return whether the controller reported a stand before and after each time, (k,)."""
         reports = self._run.effective_command
         if reports is None:
             return np.zeros(len(times), bool)
@@ -186,7 +188,7 @@ class PolicyReplay:
 
     @cached_property
     def base(self) -> Replay:
-        """The replay of the policy as its file says."""
+        """The replay with the unchanged policy and observation."""
         return self.run(Variant("as the file says"))
 
     @cached_property

@@ -1,4 +1,7 @@
-"""Reads a recording into a `Run`: of this stack, of others' LowState and LowCmd, or a table of joints."""
+"""Reads a recording into a `Run`: own topics, another stack's topics, or a table of joints.
+
+`run` defines the result, and `quadvel_recordings` decodes the files.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +28,7 @@ from .run import Commands, Imu, Modes, Run
 TICK_S = 1e-3
 """Unit of the robot's counter."""
 MIN_STATES = 20
+"""Fewest states of a recording that can be examined."""
 STATE, COMMAND = "quadvel_msgs/msg/LowState", "quadvel_msgs/msg/LowCmd"
 OTHERS_STATE = "unitree_go/msg/LowState"
 OTHER_TYPES = {
@@ -102,14 +106,18 @@ def _rows(messages: Sequence[Any], field: str) -> Array:
 
 
 def _own_commands(messages: Sequence[Any], states: Sequence[Any], start: float) -> Commands:
-    """Commands in the order of their stamps; one that answers an unrecorded state counts to the one before it."""
+    """Return the commands in the order of their stamps, each with the state that it answers.
+
+    If that state was not recorded, it is the recorded state before it.
+    """
     messages = sorted(messages, key=lambda m: seconds(m.stamp))
     ticks = np.array([m.tick for m in states])
     answers = np.searchsorted(ticks, [m.tick for m in messages], side="right") - 1
     answers = np.maximum(answers, 0)
     fields = {field: _rows(messages, field) for field in ("q", "dq", "tau", "kp", "kd")}
     stamps, state_stamps = (np.array([seconds(m.stamp) for m in each]) for each in (messages, states))
-    # A simulated clock stands still between states: stamps of commands are then those of some state, and say nothing.
+    # A simulated clock does not advance between states. All stamps of commands are then equal to
+    # those of states, and a command gets the stamp of the state that it answers.
     if np.isin(_microseconds(stamps), _microseconds(state_stamps)).all():
         stamps = state_stamps[answers]
     return Commands(
@@ -125,7 +133,7 @@ def _microseconds(stamps: Array) -> Indices:
 
 
 def _other_series(found: Messages, start: float) -> dict[str, Any]:
-    """The slower topics, as far as they were recorded."""
+    """Return the slower topics that were recorded."""
     given: dict[str, Any] = {}
     if found["estimate"]:
         given["estimate"] = _series(

@@ -1,4 +1,7 @@
-"""What a diagnosis says: sentences for the terminal, JSON for programs, and one picture."""
+"""What a diagnosis says: sentences for the terminal, JSON for programs, and one picture.
+
+`diagnosis` finds the cause, and `cli` prints or saves the result.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Everything that a recording says about a run, on one time base. No file formats; `reading` knows those."""
+"""Everything that a recording holds about a run, on one time base. It knows no file formats.
+
+`reading` reads the files. `signals` computes quantities from it that several causes use.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Signals of a run that several causes use, computed when they are first needed."""
+"""Signals of a run that several causes use, computed when they are first needed.
+
+Causes in `links` read them; `run` holds the recorded data, in s, rad, rad/s and N m.
+"""
 
 from __future__ import annotations
 

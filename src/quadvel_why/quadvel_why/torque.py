@@ -26,13 +26,13 @@ MIN_ROWS, MIN_EXACT_ROWS = 60, 8
 MAX_EXACT_DELAY_S = 0.031
 REGRESSORS = 4
 EQUAL_ERROR = 1.02
-"""Delays whose error is within this factor of the least are one plateau."""
+"""Ratio to the least error up to which delays count as equally good."""
 LITTLE_TORQUE_NM = 8.0
-"""Torque that no drive fails to give: fits start from these rows."""
+"""Torque that every healthy drive gives, N m; fits start from rows below it."""
 MIN_SPREAD_NM = 0.05
 FIT_ROUNDS = 5
 OUTLIER = 4.0
-"""Rows further off than this many (robust) standard deviations are left out of a fit."""
+"""Residual, in robust standard deviations, above which a row is left out of a fit."""
 
 
 def robust_std(values: Array) -> float:
@@ -52,13 +52,13 @@ class DriveFit:
     """Fit of one joint.
 
     Attributes:
-        command: a_1.
-        angle: a_2.
-        speed: a_3.
-        offset: b, rad.
+        command: a_1 of the module's equation: factor of kp q_des + tau_ff, 1 if healthy.
+        angle: a_2: factor of kp q, 1 if healthy.
+        speed: a_3: factor of kd (dq_des - dq), 1 if healthy.
+        offset: b: offset of the zero of the angle, rad, 0 if healthy.
         errors: Standard errors of the four, (4,).
         share_used: Share of the rows that are no outliers.
-        spread: Standard deviation of what is left in these rows, N m.
+        spread: Standard deviation of the residual torque in these rows, N m.
     """
 
     command: float
@@ -71,7 +71,7 @@ class DriveFit:
 
 
 class ExactModel:
-    """PD law with the gains as commanded, for every pairing and sign: it says much with few rows.
+    """PD law with the commanded gains, for every pairing and sign: few rows suffice.
 
         tau_i = clip(kp_j (s q_des,j - q_i) + s tau_ff,j - kd_j dq_i, -limit, limit),  s = 1 or -1
 

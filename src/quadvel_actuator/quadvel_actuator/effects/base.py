@@ -106,9 +106,9 @@ class Parameter:
     Attributes:
         name: name in files and reports.
         unit: its unit.
-        low: lower bound.
-        high: upper bound.
-        scale: usual size, which numerical derivatives need.
+        low: lower bound, in `unit`.
+        high: upper bound, in `unit`.
+        scale: usual size, in `unit`; numerical derivatives need it.
     """
 
     name: str

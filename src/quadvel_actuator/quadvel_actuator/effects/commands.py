@@ -1,4 +1,7 @@
-"""Commands that are lost: the drive continues with an earlier one."""
+"""Commands that are lost: the drive continues with an earlier one.
+
+`quadvel_sysid.search.lost_commands` infers the times of losses from a log.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Dynamic effects: lags and filters in the drive, rotor inertia, and time stamps that are off."""
+"""Dynamic effects: lags and filters in the drive, rotor inertia, and time stamps that are off.
+
+`base` defines the interface, and `recurrence` computes the filters step by step.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Effects of position: offset, spring, cogging, deadband, backlash and hysteresis."""
+"""Effects of position: offset, spring, cogging, deadband, backlash and hysteresis.
+
+`base` defines the interface, and `recurrence` computes backlash and hysteresis step by step.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Gains that vary with torque sign, time, temperature or voltage; coupling between joints."""
+"""Gains that vary with torque sign, time, temperature or voltage; coupling between joints.
+
+`quadvel_sysid.search.effect_candidates.gains` has what the identification needs to find them.
+"""
 
 from __future__ import annotations
 

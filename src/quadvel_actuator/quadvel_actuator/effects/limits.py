@@ -1,4 +1,7 @@
-"""Limits on the torque and on its rate of change."""
+"""Limits on the torque and on its rate of change.
+
+`base` defines the interface; `recurrence` computes the rate limit step by step.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Service clients."""
+"""Service clients: send requests, and complete a future for each response.
+
+`wire.CallEndpoint` encodes and sends; `service` is the other side; the executor takes responses
+from a client and completes the futures while the node spins.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,7 @@ from .logging import get_logger
 from .task import Future
 
 SERVICE_POLL_PERIOD_S = 0.01
+"""Time between two checks for a service, s."""
 
 
 class Client(Partial):
@@ -64,10 +69,10 @@ class Client(Partial):
         return future
 
     def remove_pending_request(self, future: Future) -> None:
-        """Ignore the response of a request.
+        """Forget a request, so that its response is ignored.
 
         Args:
-            future: Future of the request.
+            future: Future that `call_async` returned for the request.
         """
         with self._lock:
             self._pending = {number: other for number, other in self._pending.items() if other is not future}
@@ -101,7 +106,10 @@ class Client(Partial):
         self._endpoint.close()
 
     def _take(self) -> Callable[[], Any] | None:
-        """Return a call that completes the future of a received response, or None."""
+        """Take one response; return a function that completes its future, or None.
+
+        None stands for: no response, a damaged one, or one that this client does not wait for.
+        """
         sample = self._reader.take()
         if sample is None:
             return None

@@ -1,4 +1,7 @@
-"""Publishers of topics."""
+"""Publishers of topics.
+
+`messages` serializes, and `wire` writes to DDS.
+"""
 
 from __future__ import annotations
 

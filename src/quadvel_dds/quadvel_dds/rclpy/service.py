@@ -1,4 +1,7 @@
-"""Services."""
+"""Services.
+
+`wire.CallEndpoint` encodes and sends; `client` is the other side; the executor runs the callback.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Subscriptions of topics."""
+"""Subscriptions of topics.
+
+`wire` reads from DDS, `messages` deserializes, and the executor runs the callback.
+"""
 
 from __future__ import annotations
 

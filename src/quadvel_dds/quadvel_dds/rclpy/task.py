@@ -1,4 +1,7 @@
-"""Futures."""
+"""Futures.
+
+`client` returns futures, and the executor completes them while the node spins.
+"""
 
 from __future__ import annotations
 

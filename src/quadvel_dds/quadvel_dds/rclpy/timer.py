@@ -1,4 +1,7 @@
-"""Timers with absolute deadlines."""
+"""Timers with absolute deadlines.
+
+The executor waits for the next deadline and runs the callback.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Connection to the joints: `rt/lowcmd` and `rt/lowstate` on the robot's bus. No ROS."""
+"""Connection to the joints: `rt/lowcmd` and `rt/lowstate` on the robot's bus. No ROS.
+
+`wire` encodes the samples, and `bus` handles DDS; `link` decides what to send and when.
+"""
 
 from __future__ import annotations
 

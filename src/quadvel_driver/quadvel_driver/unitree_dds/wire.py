@@ -6,7 +6,8 @@ the robot, which holds the same fields at other places: its first motor starts a
 Padding of the body is covered, too, and has to be zero, so no flipped bit passes.
 
 A message has room for 20 motors; quadrupeds use the first twelve, in the order FR, FL, RR, RL, each
-hip, thigh, calf. `link` handles time, `bus` handles DDS.
+hip, thigh, calf. `link` handles time, `bus` handles DDS. `board_state` and
+`quadvel_description.state` give the units and frames of the records.
 """
 
 from __future__ import annotations

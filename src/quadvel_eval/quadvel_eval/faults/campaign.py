@@ -1,4 +1,8 @@
-"""Runs the fault campaign: every fault in every relevant mode, with random seeds, against its oracle."""
+"""Runs the fault campaign: each fault in each relevant mode with random seeds, against an oracle.
+
+`injection` makes the faults, `stack` simulates robot and nodes, `cases` has the oracles, and
+`report` writes the result.
+"""
 
 from __future__ import annotations
 
@@ -46,12 +50,13 @@ class FaultRun:
         seed: Seed of the run.
         fault: Name of the finding that stopped the robot.
         findings: Names of all findings, in order.
-        named_after: Time until the first expected finding.
-        safe_after: Time until the expected end: damped, or standing.
+        named_after: Time until the first expected finding, s.
+        safe_after: Time until the expected end (damped, or standing), s.
         ended: Final mode of the supervisor.
         fell: Whether the robot fell.
-        torque: Largest torque, divided by the limit of the drive.
-        speed: Largest speed of a joint that its drive accelerates, divided by the drive's limit.
+        torque: Largest torque over the limit of the drive, as a ratio.
+        speed: Largest speed of a joint that its drive accelerates over the drive's limit, as a
+            ratio.
         too_fast: Longest time in which a drive accelerated a joint above MAX_SPEED_RATIO, s.
         beyond: Largest overtravel of a joint beyond its mechanical range, rad.
         wrong: Violations of the oracle, one sentence each.

@@ -1,4 +1,7 @@
-"""Cases of the fault campaign with their oracles: expected findings, expected end, and deadlines."""
+"""Cases of the fault campaign with their oracles: expected findings, expected end, and deadlines.
+
+This module only lists them. `injection` makes the faults, and `campaign` runs and judges the cases.
+"""
 
 from __future__ import annotations
 

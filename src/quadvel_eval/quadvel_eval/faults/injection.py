@@ -1,4 +1,8 @@
-"""Injects faults into a `Stack`: each component with each kind of fault that makes sense for it."""
+"""Injects faults into a `Stack`: each component with each kind of fault that makes sense for it.
+
+`stack` simulates the robot and its processes; `cases` states what must happen after each fault;
+`campaign` runs all cases and compares. Times are ms of the simulation unless stated otherwise.
+"""
 
 from __future__ import annotations
 
@@ -14,16 +18,23 @@ from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.state import RobotState
 from quadvel_sim.simulator import DT
 
-from .stack import Link, Message, Stack, corrupt
+from .stack import STATE_PERIOD_MS, Link, Message, Stack, corrupt
 
 KINDS = ("off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent", "duplicated")
+"""Kinds of faults.
+
+`off` sends nothing or zeros, `stuck` repeats an old value or stops a process, `garbage` is random
+numbers, and `wrong` is a value with an offset or a factor.
+"""
 Rng = np.random.Generator
 Deliveries = list[tuple[int, Message]]
+"""Delay in ms and content of each message that a link delivers for one that was sent."""
 
 DELAY_MS = 80  # of delayed messages and sensors
 SLOW_LINK_DIVISOR = 16  # a slow link passes one message in so many
 MAX_DROPOUT_MS = 15  # of an intermittent link
 PAUSE_MS = 100  # of an intermittent process
+SLOW_SENSOR_PERIOD_MS = 200  # between two new values of a slow sensor
 
 
 @attrs.frozen
@@ -66,7 +77,7 @@ def make_injection(component: str, kind: str) -> Injection:
     return Injection(component, kind, known[kind])
 
 
-# Faults of links: functions from a link to what happens to each message.
+# Faults of links: each function returns, for a link, what the link does with each message.
 
 
 def _link(
@@ -177,7 +188,7 @@ class _Sensor:
 
     def __init__(self, kind: str, places: dict[str, Bools], rng: Rng) -> None:
         self._kind, self._places, self._rng = kind, places, rng
-        self._past: list[tuple[int, RobotState]] = []
+        self._past: list[tuple[int, RobotState]] = []  # time in ms and state, every STATE_PERIOD_MS
 
     def __call__(self, now: int, state: RobotState) -> RobotState:
         self._past.append((now, state))
@@ -188,16 +199,17 @@ class _Sensor:
         return attrs.evolve(state, **values)
 
     def _value(self, field: str, now: int, true: Array) -> Any:
-        """Faulty value of a field."""
+        """Return the faulty value of a field, in the unit of the field."""
         kind, begun = self._kind, self._past[0]
         if kind == "off" or (kind == "intermittent" and self._rng.random() < 0.3):
             return 0.0
         if kind == "stuck":
             return getattr(begun[1], field)
-        if kind == "slow":  # a new value every 200 ms
-            return getattr(self._past[(now - begun[0]) // 200 * 200 // 5][1], field)
+        if kind == "slow":
+            period = SLOW_SENSOR_PERIOD_MS
+            return getattr(self._past[(now - begun[0]) // period * period // STATE_PERIOD_MS][1], field)
         if kind == "delayed":
-            return getattr(self._past[max(len(self._past) - 1 - DELAY_MS // 5, 0)][1], field)
+            return getattr(self._past[max(len(self._past) - 1 - DELAY_MS // STATE_PERIOD_MS, 0)][1], field)
         if kind == "garbage":
             return self._rng.normal(0.0, GARBAGE[field], np.shape(true))
         return _wrong(field, true) if kind == "wrong" else true
@@ -214,10 +226,11 @@ GARBAGE = {
 }
 """Standard deviation of garbage, in the unit of the field."""
 MOUNTING_TILT = np.array([np.cos(0.25), np.sin(0.25), 0.0, 0.0])
+"""Quaternion (w, x, y, z) of a rotation by 0.5 rad about x."""
 
 
 def _wrong(field: str, true: Array) -> Array:
-    """Add an offset to a field; the orientation gets a wrong mounting (Hamilton product with a tilt)."""
+    """Add an offset to a field, in its unit; an orientation gets the tilt of a wrong mounting."""
     if field == "quaternion":
         # Hamilton product q * (a, b, 0, 0): rotation by 2 acos(a) about the body's x axis.
         w, x, y, z = true
@@ -251,7 +264,7 @@ def _killed(name: str) -> Callable[[Stack, Rng], None]:
 
 
 def _stopped(name: str) -> Callable[[Stack, Rng], None]:
-    """Stop a process without an end."""
+    """Stop a process without resuming it; its input waits in a queue."""
 
     def begin(stack: Stack, rng: Rng) -> None:
         stack.processes[name].stopped = True
@@ -260,7 +273,7 @@ def _stopped(name: str) -> Callable[[Stack, Rng], None]:
 
 
 def _pausing(name: str) -> Callable[[Stack, Rng], None]:
-    """Stop a process for PAUSE_MS in every three."""
+    """Stop a process for PAUSE_MS in every three periods of PAUSE_MS."""
 
     def begin(stack: Stack, rng: Rng) -> None:
         process, report = stack.processes[name], stack.sensor_fault
@@ -278,7 +291,7 @@ def _pausing(name: str) -> Callable[[Stack, Rng], None]:
 
 
 def _set_clock(by: float) -> Callable[[Stack, Rng], None]:
-    """Set the machine's clock forward or back by some seconds."""
+    """Set the machine's clock forward or back by `by` seconds."""
 
     def begin(stack: Stack, rng: Rng) -> None:
         stack.clock_offset += by * float(rng.choice((-1.0, 1.0)))

@@ -1,4 +1,7 @@
-"""Writes the result of the fault campaign as JSON, table and picture."""
+"""Writes the result of the fault campaign as JSON, table and picture.
+
+`campaign` runs the cases and judges them; nothing is judged here.
+"""
 
 from __future__ import annotations
 

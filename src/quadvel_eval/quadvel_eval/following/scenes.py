@@ -1,4 +1,8 @@
-"""Simulates scenes that are hard for a planner that follows a person, each from a seed."""
+"""Simulates scenes that are hard for a planner that follows a person, each from a seed.
+
+`people.scenes` has the scenes for the tracker alone; `stage` simulates robot and people in a scene,
+and `measure` scores the runs. Positions are in the world frame, m.
+"""
 
 from __future__ import annotations
 

@@ -81,9 +81,9 @@ class FollowSample:
 
     Attributes:
         time: Time, s.
-        pose: x, y (m) and yaw (rad) of the robot.
-        velocity: vx, vy (m/s) and wz (rad/s) of the robot.
-        command: Commanded velocity after the mux.
+        pose: x, y (m) and yaw (rad) of the robot, world frame.
+        velocity: vx, vy (m/s) and wz (rad/s) of the robot, body frame.
+        command: Commanded vx, vy (m/s) and wz (rad/s) after the mux, body frame.
         person: Position of the person (2,), m.
         state: State of the planner.
         words: Explanation of the state.

@@ -76,7 +76,7 @@ class TourSample:
         pose: True x, y (m) and yaw (rad) of the robot.
         person: True x, y (m) and yaw (rad) of the person.
         commanded: Commanded vx, vy (m/s) and wz (rad/s), averaged over a stride.
-        velocity: True velocity in the same order, averaged over a stride.
+        velocity: True vx, vy (m/s) and wz (rad/s), body frame, averaged over a stride.
         state: State of the planner.
         words: Explanation of the state.
         clearance: Distance from the outline to the nearest obstacle, m; inf if none is near.

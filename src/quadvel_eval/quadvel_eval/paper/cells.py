@@ -1,4 +1,7 @@
-"""Jobs and records of walks of one command, as on the grid of `quadvel eval`."""
+"""Jobs and records of walks of one command, as on the grid of `quadvel eval`.
+
+`conditions` varies the plants of such walks; the sections of this folder choose the commands.
+"""
 
 from __future__ import annotations
 

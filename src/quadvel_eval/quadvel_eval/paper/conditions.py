@@ -1,4 +1,7 @@
-"""Walks of the same commands on many plants: conditions, survival rate and error plots."""
+"""Walks of the same commands on many plants: conditions, survival rate and error plots.
+
+`cells` makes the record of one walk; `slopes`, `robustness` and `gap` choose the conditions.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Figure 12: cost of transport and of turning (Eq. 10) over speed."""
+"""Figure 12: cost of transport and of turning (Eq. 10) over speed.
+
+`cells` makes the jobs; `study` runs the section.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Compares the velocity estimators by speed and ground: learned network and Kalman filter."""
+"""Compares the velocity estimators by speed and ground: learned network and Kalman filter.
+
+`quadvel_estimator` holds the estimators; `study` runs the section.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Figure 6: change of the gait over a velocity ramp, with gait figures per window."""
+"""Figure 6: change of the gait over a velocity ramp, with gait figures per window.
+
+`symmetry` compares left and right legs, and `gait_kind` classifies the gait. `study` runs the
+section.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Reality gap: policies on plants whose drives have effects that the actuator model lacks."""
+"""Reality gap: policies on plants whose drives have effects that the actuator model lacks.
+
+`conditions` makes the jobs and draws the errors; `study` runs the section.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Section 4.2 and Figure 4: identifies the actuator model from a simulated log of Eq. 9."""
+"""Section 4.2 and Figure 4: identifies the actuator model from a simulated log of Eq. 9.
+
+`quadvel_sysid.identify` fits the model; `study` runs the section.
+"""
 
 from __future__ import annotations
 

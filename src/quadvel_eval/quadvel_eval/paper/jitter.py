@@ -1,4 +1,7 @@
-"""Figure 9: action jitter, the mean absolute second difference of three consecutive actions."""
+"""Figure 9: action jitter, the mean absolute second difference of three consecutive actions.
+
+`study` runs the section.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Figure 11: walks the letters ZJU in open loop and measures the deviation from them."""
+"""Figure 11: walks the letters ZJU in open loop and measures the deviation from them.
+
+`quadvel_follow.trajectory` supplies the letters as trajectories; `study` runs the section.
+"""
 
 from __future__ import annotations
 

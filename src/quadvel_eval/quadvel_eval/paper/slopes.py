@@ -1,4 +1,8 @@
-"""Robustness to slopes: survival and tracking after two kinds of start, on three plants."""
+"""Robustness to slopes: survival and tracking after two kinds of start, on three plants.
+
+`conditions` makes the jobs and draws the plots, `robustness` covers the other conditions, and
+`study` runs the section.
+"""
 
 from __future__ import annotations
 

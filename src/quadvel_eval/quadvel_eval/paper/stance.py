@@ -1,4 +1,7 @@
-"""Standing still: drift, steps and joint speed, compared with constant joint targets."""
+"""Standing still: drift, steps and joint speed, compared with constant joint targets.
+
+`gait` evaluates walking; `study` runs the section.
+"""
 
 from __future__ import annotations
 

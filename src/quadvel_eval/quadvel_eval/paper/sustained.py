@@ -1,4 +1,7 @@
-"""Section 4.3: largest sustained velocities in six directions, and the load of the drives."""
+"""Section 4.3: largest sustained velocities in six directions, and the load of the drives.
+
+`study` runs the section; `quadvel_training.limiting` writes narrower limits into a policy file.
+"""
 
 from __future__ import annotations
 

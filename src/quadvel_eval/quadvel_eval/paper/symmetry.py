@@ -1,4 +1,8 @@
-"""Figures 7 and 8: torque over velocity of left and right legs, and actions over a gait cycle."""
+"""Figures 7 and 8 of the paper: torque over velocity of all legs, and actions over a gait cycle.
+
+`walk.record_walk` simulates the walks, `study` runs the section, and `files.write_section` writes
+CSV, figure and JSON.
+"""
 
 from __future__ import annotations
 
@@ -45,11 +49,11 @@ def resample_cycles(down: Indices, values: Array) -> Array:
     """Cut series into gait cycles and interpolate each at PHASES_PER_CYCLE even phases.
 
     Args:
-        down: Samples of the touchdowns of a foot.
-        values: Series (n, k).
+        down: Indices of the samples at which a foot touches down, increasing.
+        values: Series, (n, k), sampled at the same times.
 
     Returns:
-        Values (cycles, PHASES_PER_CYCLE, k).
+        Values, (cycles, PHASES_PER_CYCLE, k), in the unit of the series.
     """
     # Phase p of a cycle from tick t_k to t_{k+1} lies at t_k + p (t_{k+1} - t_k).
     ticks, phases = np.arange(len(values)), np.arange(PHASES_PER_CYCLE) / PHASES_PER_CYCLE
@@ -61,15 +65,16 @@ def resample_cycles(down: Indices, values: Array) -> Array:
 def leg_curves(walk: Walk, leg: str) -> dict[str, Array] | None:
     """Compute torque, velocity and targets of a leg's joints over the gait cycle.
 
-    Right legs are mirrored, so that a symmetric gait gives equal curves.
+    Right legs are mirrored in all three, so that a symmetric gait gives equal curves. Torque and
+    velocity are means of all cycles; the targets are those of the first cycle.
 
     Args:
         walk: The walk.
         leg: Name of the leg.
 
     Returns:
-        Mean torque (N m), mean velocity (rad/s) and targets of one cycle (rad), each
-        (PHASES_PER_CYCLE, 3) from touchdown on; None without two full cycles.
+        `torque` (N m), `velocity` (rad/s) and `target` (rad), each (PHASES_PER_CYCLE, 3) from
+        touchdown on, with columns in the order of PARTS; None without two full cycles.
     """
     late = walk.time >= SETTLING_TIME_S
     i = LEGS.index(leg)
@@ -113,10 +118,10 @@ def asymmetry(records: Sequence[Record]) -> float:
 
 @attrs.frozen
 class Symmetry(Section):
-    """One straight walk per policy and speed.
+    """One straight walk per policy and speed. A record holds one phase of one leg.
 
     Attributes:
-        speeds: Commanded velocities, m/s.
+        speeds: Commanded velocities, m/s; the policy's fastest if that is less.
     """
 
     name: ClassVar[str] = "symmetry"
@@ -179,7 +184,7 @@ class Symmetry(Section):
 
 
 def _phase_record(curves: dict[str, Array], k: int) -> Record:
-    """Columns of one phase."""
+    """Return the columns of one phase: torque (N m), velocity (rad/s), target (rad) by joint."""
     values = {
         f"{part}_{name}": float(curve[k, joint])
         for joint, part in enumerate(PARTS)

@@ -1,4 +1,7 @@
-"""Figure 10: velocity tracking over the paper's grid and over the quick grid, on two plants."""
+"""Figure 10: velocity tracking over the paper's grid and over the quick grid, on two plants.
+
+`cells` makes the record of one walk; `study` runs the section.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Scores leg detection and person tracking on recorded scans and in simulated scenes."""
+"""Scores leg detection and person tracking on recorded scans and in simulated scenes.
+
+`scenes` simulates the scenes; `quadvel_follow` holds the detector and the tracker that are scored.
+"""
 
 from __future__ import annotations
 

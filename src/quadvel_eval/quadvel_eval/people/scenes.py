@@ -1,4 +1,8 @@
-"""Simulates scenes that are hard for person trackers: crossing, occlusion, walking along walls."""
+"""Simulates scenes that are hard for person trackers: crossing, occlusion, walking along walls.
+
+`quadvel_sim.walker` moves the people, `laser` computes the scans, and `measure` runs the trackers
+and scores them. Positions are in the world frame: m, x and y in the plane; yaw in rad from x to y.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ from quadvel_sim.walker import Walker, leg_circles
 from .laser import FloorPlan, Laser
 
 WALKING_STEP_S = 0.01  # simulation step of the people
-RESOLUTIONS = np.deg2rad([0.25, 0.36, 0.5, 1.0])
+RESOLUTIONS = np.deg2rad([0.25, 0.36, 0.5, 1.0])  # rad between two rays
 SCAN_RATES_HZ = (10.0, 20.0, 40.0)
 
 
@@ -23,10 +27,10 @@ class SceneScan:
     """One scan of a scene.
 
     Attributes:
-        time: Time, s.
-        ranges: Ranges (rays,), m.
-        pose: x, y (m) and yaw (rad) of the scanner.
-        people: True positions of the people (people, 2), m.
+        time: Time since the start of the scene, s.
+        ranges: Ranges, (rays,), m; no return is as `Laser.no_return` states.
+        pose: x, y (m) and yaw (rad) of the scanner in the world frame.
+        people: True positions of the people in the world frame, (people, 2), m.
     """
 
     time: float
@@ -46,7 +50,8 @@ class Scene:
         walkers: The people.
         duration: Duration, s.
         rng: Random number generator of the noise.
-        pose: Function from the people's positions (people, 2) to the scanner's pose x, y, yaw.
+        pose: Function from the people's positions, (people, 2), m, to the scanner's pose: x, y in
+            m, yaw in rad. The default is a scanner that rests at the origin.
     """
 
     laser: Laser
@@ -75,7 +80,7 @@ class Scene:
 
 
 def crossing(seed: int) -> Scene:
-    """Create two people whose paths cross at a random angle, within half a metre of each other.
+    """Create two people whose paths cross at a random angle, and who pass within half a metre.
 
     Args:
         seed: Seed of the scene.
@@ -171,7 +176,7 @@ SCENES: Mapping[str, Callable[[int], Scene]] = {
 
 
 def _walker(rng: np.random.Generator, way: ArrayLike, speed: float) -> Walker:
-    """Create a walker with random legs and gait."""
+    """Create a walker with random legs and gait. Way: (n, 2), m; speed: m/s."""
     return Walker(
         way=way,
         speed=speed,
@@ -195,7 +200,7 @@ def _laser(rng: np.random.Generator) -> Laser:
 
 
 def _trees(rng: np.random.Generator, free: Array) -> FloorPlan:
-    """Create some trees farther than 2 m from `free`, and two walls."""
+    """Create two walls, and trees farther than 2 m from `free` and 1 m from the origin."""
     trees = [(*rng.uniform(-7.0, 7.0, 2), rng.uniform(0.1, 0.3)) for _ in range(6)]
     kept = [tree for tree in trees if np.hypot(*(tree[:2] - free)) > 2.0 and np.hypot(*tree[:2]) > 1.0]
     return FloorPlan(kept, [[-8.0, 7.5, 8.0, 7.5], [-8.0, -7.5, 8.0, -7.5]])

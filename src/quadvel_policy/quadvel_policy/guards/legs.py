@@ -1,4 +1,8 @@
-"""Guards of the legs: encoders, drives and feet. No ROS."""
+"""Guards of the legs: encoders, drives and feet. No ROS.
+
+`guard` runs the guards, and the supervisor acts on what they find; docs/faults.md lists all of
+them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Guards of the messages with states, and of the process that answers them. No ROS."""
+"""Guards of the messages with states, and of the process that answers them. No ROS.
+
+`guard` runs the guards; the supervisor acts on what they find.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Guards of the velocity of the trunk, which the policy needs. No ROS."""
+"""Guards of the velocity of the trunk, which the policy needs. No ROS.
+
+`guard` runs the guards; the supervisor replaces a rejected estimate by `backup_velocity`.
+Velocities are in the body frame, m/s.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Runs the network of an imported policy; its metadata say what the numbers mean."""
+"""Runs the network of an imported policy; its metadata say what the numbers mean.
+
+`importer` reads the formats, `metadata` describes the numbers, and `observation` builds the input.
+"""
 
 from __future__ import annotations
 

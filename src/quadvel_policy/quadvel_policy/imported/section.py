@@ -1,4 +1,7 @@
-"""Typed access to the fields of a file in another project's format; errors name file and field."""
+"""Typed access to the fields of a file in another project's format; errors name file and field.
+
+`mjlab`, `rl_sar` and `unitree_rl_lab` read their formats through it.
+"""
 
 from __future__ import annotations
 

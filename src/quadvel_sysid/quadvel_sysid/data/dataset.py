@@ -1,4 +1,8 @@
-"""The logs of one identification: checked, with torque, and cut into excerpts where they are long."""
+"""The logs of one identification: checked, with torque, and cut into excerpts where they are long.
+
+`logs` reads and checks the files; `signals` and `split` make samples and data parts from the
+result.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Compiled interpolation of time series; an identification reads logs at thousands of delays."""
+"""Compiled interpolation of time series; an identification reads logs at thousands of delays.
+
+`log_signals` is the only user; it decides which series to read and at what times.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Signals of one log at any time: interpolated states, held commands, and accelerations."""
+"""Signals of one log at any time: interpolated states, held commands, and accelerations.
+
+`dataset` holds the logs, `interpolation` has the compiled loops, and `signals` joins several logs.
+Units: s, rad, rad/s, N m.
+"""
 
 from __future__ import annotations
 

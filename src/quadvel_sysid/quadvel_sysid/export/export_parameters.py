@@ -1,4 +1,7 @@
-"""Export a fitted model as `ActuatorParameters`, the file format of the simulator."""
+"""Export a fitted model as `ActuatorParameters`, the file format of the simulator.
+
+`quadvel_actuator.parameters` has the format; `export.replay` compares the models in a log.
+"""
 
 from __future__ import annotations
 

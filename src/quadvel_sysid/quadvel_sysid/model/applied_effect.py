@@ -1,4 +1,7 @@
-"""An effect with its parameter values on the joints that it acts on."""
+"""An effect with its parameter values on the joints that it acts on.
+
+`search` fits the values; `torque_model.Model` evaluates several effects together.
+"""
 
 from __future__ import annotations
 

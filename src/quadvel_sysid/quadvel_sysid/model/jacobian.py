@@ -1,4 +1,7 @@
-"""Jacobian of the torque: derivatives with respect to gains, effect parameters and delays."""
+"""Jacobian of the torque: derivatives with respect to gains, effect parameters and delays.
+
+`fit` solves the normal equations with it, and `statistics.confidence` derives standard errors.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +25,9 @@ class Unknowns:
 
     Attributes:
         index: Unknown of slot a on joint j, (A, J); -1 where the slot is not fitted.
-        low: Lower bounds of the unknowns, (K,).
-        high: Upper bounds of the unknowns, (K,).
-        step: Step of the finite differences of each slot, (A,).
+        low: Lower bounds of the unknowns, (K,), each in the unit of its parameter.
+        high: Upper bounds of the unknowns, (K,), in the same units.
+        step: Step of the finite differences of each slot, (A,), in the unit of its parameter.
     """
 
     index: Indices

@@ -1,4 +1,7 @@
-"""Forward model of the joint torque: the EAM with effects, as the identification evaluates it.
+"""Forward model of the joint torque, as the identification evaluates it.
+
+It is the empirical actuator model (EAM: PD gains and two delays) with effects. This module only
+evaluates; `data.plain_model` fits the EAM, and `search` fits effects, gains and delays together.
 
 The equations, in the order in which a drive computes them:
 

@@ -1,4 +1,7 @@
-"""Figures of an identification report, as SVG text in the text colour of the page."""
+"""Figures of an identification report, as SVG text in the text colour of the page.
+
+`page` places the figures; the series come from `identification.Identification`.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
 """Result records of an identification: report, corrected model and series for the figures.
 
-`identify` fills these records, and `report` writes them.
+`identify` fills these records, and `report` writes them. "Plain EAM" is the empirical actuator
+model without effects (`data.plain_model`); "corrected model" is the same model with the effects
+found.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ class Trace:
     """Held-out torque series of one joint, (n,) each.
 
     Attributes:
-        t: Time, s; gaps where no rows were held out.
+        t: Times of the held-out rows, s; with gaps, since the rows between them were fitted.
         measured: Measured torque, N m. It and the predictions are NaN where samples are invalid.
         pd: Torque of the ideal PD law, N m.
         before: Torque of the plain EAM, N m.

@@ -1,4 +1,7 @@
-"""Build the report and the figure series from the results of an identification."""
+"""Build the report and the figure series from the results of an identification.
+
+`identification` holds the records, `report` writes the files, and `page` renders the HTML.
+"""
 
 from __future__ import annotations
 

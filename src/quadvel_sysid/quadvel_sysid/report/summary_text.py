@@ -1,4 +1,7 @@
-"""Summary of an identification report in one or two sentences."""
+"""Summary of an identification report in one or two sentences.
+
+Its input is report.json as a mapping; the numbers are computed in `outcome`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Candidate effects on top of a model: screened, then the best ones fitted with everything else."""
+"""Candidate effects on top of a model: screened, then the best ones fitted with everything else.
+
+`screening` ranks candidates without fitting them; `selection` decides which one is kept.
+"""
 
 from __future__ import annotations
 

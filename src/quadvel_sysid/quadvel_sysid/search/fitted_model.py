@@ -1,4 +1,7 @@
-"""Fitted models and their selection criterion, which the search compares."""
+"""Fitted models and their selection criterion, which the search compares.
+
+`model.fit` fits a model, `statistics.criterion` defines the criterion, and `selection` searches.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Library of candidate regressors of named signals, and their refinement."""
+"""Library of candidate regressors of named signals, and their refinement.
+
+`regressors` evaluates them, and `candidates` screens and fits them.
+"""
 
 from __future__ import annotations
 

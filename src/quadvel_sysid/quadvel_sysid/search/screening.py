@@ -57,7 +57,7 @@ class ScreenedCandidate:
 
     Attributes:
         model: Model with the candidate as its last effect.
-        score: Expected reduction of the criterion.
+        score: Expected reduction of the criterion of `statistics.criterion`.
     """
 
     model: Model

@@ -1,4 +1,7 @@
-"""Statistics of model selection: clustered score test, whiteness, thresholds."""
+"""Statistics of model selection: clustered score test, whiteness, thresholds.
+
+`search` applies it to models; nothing is fitted here.
+"""
 
 from __future__ import annotations
 

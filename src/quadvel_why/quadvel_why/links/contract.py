@@ -17,7 +17,7 @@ from ..imu import USUAL_GYROSCOPE, USUAL_QUATERNION
 from ..signals import Signals
 
 CLEAR_COEFFICIENT = 0.3
-"""Of the PD law; below that a coefficient says nothing about sign or scale."""
+"""Smallest coefficient of the PD law that shows its sign or scale."""
 UNEXPLAINED_SHARE = 0.1
 """Share of a torque's variance that its own command leaves if the drive follows another one."""
 BETTER_PAIRING, MIN_ERROR_N2M2 = 4.0, 4.0

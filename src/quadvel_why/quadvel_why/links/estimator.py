@@ -21,18 +21,18 @@ MIN_ROWS = 40
 
 @attrs.frozen(eq=False)
 class EstimateFit:
-    """What the estimate is, in terms of the reference.
+    """Deviation of the estimated velocity from a reference, and its best explanation.
 
     Attributes:
         kind: "", "bias", "scale" or "lag".
-        amount: m/s, factor or s.
+        amount: Bias (m/s), scale (factor) or lag (s), as `kind` states.
         axis: Axis with the largest error.
         error: Root mean square of estimate minus reference, m/s.
-        left: The same with the hypothesis.
+        left: The same after the deviation of `kind` is removed, m/s.
         time: (k,), s.
         estimate: (k, 3), m/s.
         reference: (k, 3), m/s.
-        source: What the reference is.
+        source: Description of the reference, for the sentence of the cause.
     """
 
     kind: str

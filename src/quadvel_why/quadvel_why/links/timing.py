@@ -1,4 +1,9 @@
-"""Timing: do states come, does the policy run at its rate, and do commands act, each once and soon?"""
+"""Causes in timing: late, repeated or missing states and commands, and a wrong rate of the policy.
+
+Each class measures one number on a run; `cause.Cause` explains `unit`, `least`, `needs` and
+`remedy`. The limits are in limits.yaml; `diagnosis` compares numbers and limits, and `report` draws
+the traces.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +18,19 @@ from ..signals import Signals
 from .contract import joint_trace
 
 MAX_COMMANDS_LATE = 4
+"""Largest number of state periods by which a drive may be behind to be tried."""
 LOST_ERROR = 6.0
-"""A row whose torque is further off than this many standard deviations a joint may follow an older command."""
+"""Mean square error of the torques, in variances of the fit, from which a state is suspicious."""
 LOST_BETTER = 6.0
-"""Factor by which the older command has to explain it better."""
+"""Factor by which an older command must reduce the error of a suspicious state."""
 MIN_TICKS = 20
+"""Fewest ticks of walking that give a rate or a jitter."""
+MAX_UNEXPLAINED_SHARE = 0.2
+"""Share of the torque's variance that its command leaves; above it, no delay is determined."""
 
 
 def _walk_ticks(signals: Signals) -> Indices:
-    """Rows of the commands that the policy computed while walking, without repetitions."""
+    """Return the rows of the commands that the walking policy computed, without repetitions."""
     run = signals.run
     commands = run.commands
     walking = run.walking[commands.answers] & commands.servo
@@ -134,6 +143,8 @@ class LostCommands(Cause):
         gain = np.array([fit.command for fit in model.fits])
 
         def error(steps: int) -> Array:
+            # Mean over sound joints of ((tau - modelled torque) / spread)^2, if every command acts
+            # `steps` state periods later than the model has it.
             asked = model.asked_at(model.delay + steps * run.period) - model.asked
             off = (run.tau - model.modelled - gain * asked)[:, sound] / spread[sound]  # type: ignore[operator]
             return np.asarray(np.mean(np.minimum(np.abs(off), 30.0) ** 2, axis=1))
@@ -160,7 +171,8 @@ class LongDelay(Cause):
     @override
     def measure(self, signals: Signals) -> Measurement | None:
         model, trained = signals.torque, signals.trained.delay
-        if np.median(model.own_errors.min(axis=0) / model.run.tau[model.rows].var(axis=0)) > 0.2:  # type: ignore[index]
+        variance = model.run.tau[model.rows].var(axis=0)  # type: ignore[index]
+        if np.median(model.own_errors.min(axis=0) / variance) > MAX_UNEXPLAINED_SHARE:
             return None
         low, high = model.delay_range
         j = int(np.argmax(model.run.tau.std(axis=0)))  # type: ignore[union-attr]

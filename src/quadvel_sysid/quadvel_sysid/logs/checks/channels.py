@@ -1,4 +1,8 @@
-"""Checks of single channels: motionless, repeated, clipped, duplicated or missing ones."""
+"""Checks of single channels: motionless, repeated, clipped, duplicated or missing ones.
+
+`table` runs all checks in order. `response` compares channels with each other; `commands` looks for
+commands that rest.
+"""
 
 from __future__ import annotations
 

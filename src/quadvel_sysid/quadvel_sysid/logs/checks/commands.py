@@ -1,4 +1,8 @@
-"""Check that joints are under position control, by commands that rest while the joint moves."""
+"""Check that joints are under position control: find commands that rest while the joint moves.
+
+It compares spans of angle and command. `response` examines how the torque answers a command that
+moves, and `channels` examines the recorded channels alone.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from .channels import MOVING_SPAN_RAD, sample_rows
 from .response import least_squares_residual, motion_regressors
 
 MIN_SWING_RAD = 0.5
-"""rad; span of q from which a resting command is checked; a drive may yield as far to a load."""
+"""rad; smallest span of q that is checked; a drive that holds its joint yields less to a load."""
 NOISE_SPAN_SHARE = 0.01
 """Share of the span of q, below which the span of q_des is noise; a wrong unit (57 degrees a radian)
 makes 0.017.
@@ -42,7 +46,8 @@ def constant_command(log: Log) -> Iterator[Finding | Log]:
         log: The log to check.
 
     Yields:
-        A refusal if it is so on all joints; else a warning and the log with these joints invalid.
+        A refusal if all joints are concerned; else a warning, and the log with these joints
+        invalid.
     """
     swings, asked = _span(log.q), _span(log.q_des)
     resting = (asked < np.maximum(MOVING_SPAN_RAD, NOISE_SPAN_SHARE * swings)) & (swings > MIN_SWING_RAD)
@@ -72,6 +77,9 @@ def _span(angles: NDArray[np.floating]) -> Array:
 
 def _holds(log: Log, j: int) -> bool:
     """Whether the torque of joint `j` pulls back to a resting command; false without torque."""
+    # With the regressors of speed, friction and offset projected out of torque and angle:
+    #     tau' = -kp q' + e
+    #     answered = (tau' . q')^2 / (|tau'|^2 |q'|^2),   left = var(e) / var(tau)
     if log.tau is None:
         return False
     row = sample_rows(log)
@@ -79,8 +87,10 @@ def _holds(log: Log, j: int) -> bool:
     if log.tau_ff is not None:
         torque = torque - log.tau_ff[log.command_rows(log.t[row]), j]
     moved = np.asarray(motion_regressors(log.dq[row, j]), dtype=np.float64)
-    rest, angle = (least_squares_residual(moved, np.asarray(x, dtype=float)) for x in (torque, log.q[row, j]))
-    pull = float(rest @ angle)
-    answered = pull**2 / ((rest @ rest) * (angle @ angle) + 1e-12)
-    left = (1.0 - answered) * float(rest @ rest) / (len(row) * float(np.var(torque)) + 1e-12)
+    residual, angle = (
+        least_squares_residual(moved, np.asarray(x, dtype=float)) for x in (torque, log.q[row, j])
+    )
+    pull = float(residual @ angle)
+    answered = pull**2 / ((residual @ residual) * (angle @ angle) + 1e-12)
+    left = (1.0 - answered) * float(residual @ residual) / (len(row) * float(np.var(torque)) + 1e-12)
     return bool(pull < 0.0 and answered > MIN_ANSWERED_SHARE and left < MAX_HOLDING_ERROR)

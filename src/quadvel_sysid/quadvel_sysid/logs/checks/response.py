@@ -300,7 +300,7 @@ def unresponsive(log: Log, found: Response) -> Iterator[Finding]:
         found: Its response.
 
     Yields:
-        A refusal if it is so on all joints, else a warning.
+        A refusal if all joints are concerned, else a warning.
     """
     used = log.valid[found.rows].any(axis=0)
     lost = found.answered_share < MIN_ANSWERED_SHARE

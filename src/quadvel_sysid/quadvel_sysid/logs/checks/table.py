@@ -197,7 +197,7 @@ MOTION_CHECKS = (
         "note or warning, with the motion that would separate them",
     ),
 )
-"""Checks of the motion, in the rows under PD control; each runs, whatever the others find."""
+"""Checks of the motion, in the rows under PD control; all run, even after a finding."""
 
 
 def markdown_table() -> str:

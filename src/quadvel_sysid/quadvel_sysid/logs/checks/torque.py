@@ -1,4 +1,7 @@
-"""Checks of the measured torque against its command: isolated spikes, and torque without a sign."""
+"""Checks of the measured torque against its command: isolated spikes, and torque without a sign.
+
+`table` runs all checks in order; `response` finds which command a torque follows.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Candidate of lost commands, whose times are inferred from the measured torque."""
+"""Candidate of lost commands, whose times are inferred from the measured torque.
+
+`search.lost_commands` computes the probabilities; this module only turns them into an effect.
+`quadvel_actuator.effects.commands` has the effect of a running model, which draws losses at random.
+`EffectCandidate` explains the class variables and what each method is for.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +31,8 @@ class InferredCommandLoss(ErrorEffect):
     this log and not available for prediction. A running model draws its losses at random.
 
     Attributes:
-        odds: (N rows, J joints, M), probability that the drive is 0, 1, ... commands behind at each row.
+        odds: (N rows, J joints, M), probability (0 to 1) that the drive is 0, 1, ... M - 1 commands
+            behind at each row.
         usual: (M,), their mean over the fitted rows, used for prediction.
     """
 
@@ -81,6 +87,8 @@ class CommandHoldCandidate(EffectCandidate):
 
     @override
     def initial_guesses(self, s: Signals, torque: Array, residual: Array) -> Sequence[InitialGuess]:
+        # Rows at which a new command was sent; `share` starts as the mean probability of being
+        # behind.
         fresh = np.diff(s.packet[:, 0], prepend=s.packet[0, 0] - 1) > 0
         return [{"share": 1.0 - self.effect.odds[s.row[fresh, 0], :, 0].mean(axis=0)}]
 
