@@ -78,6 +78,16 @@ def test_running_commands_turn_too(grid):
     assert np.mean(np.abs(running[:, 2]) > 0.3) > 0.15
 
 
+def test_commands_along_an_axis_are_often_faster_than_what_is_followed():
+    grid = CommandGrid(GridConfig(axis=1.0, straight=0.0, near=0.0, stance=0.0, frontier=0.5))
+    for ahead in (-1.0, -0.5, 0.0, 0.5, 1.0):
+        follow(grid, (ahead, 0.0, 0.0), 8)
+    drawn = grid.draw(np.random.default_rng(0), 4000)
+    ahead = drawn[(drawn[:, 0] != 0.0), 0]
+    assert 0.5 < np.mean(np.abs(ahead) > 1.25) < 0.75
+    assert np.abs(drawn[:, 0]).max() <= 1.75
+
+
 def test_neighbours_open_where_both_xy_and_yaw_are_followed(grid):
     edge, beyond = (1.0, 0.0, 0.0), (1.5, 0.0, 0.0)
     assert grid.open[grid.cell_of(np.array(edge))]

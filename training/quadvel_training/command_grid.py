@@ -40,6 +40,8 @@ class GridConfig:
         near: share of commands near rest, which are few among all cells.
         axis: share of commands along one axis only, where limits allow the highest speeds. What the
             shares leave is drawn from all open cells.
+        frontier: share of the commands along one axis that is drawn from open cells which are not
+            followed yet; among all open cells, those at the highest speeds are rare.
         hold: s, from and to, until the next command.
         error_xy: m/s, mean error up to which a command at rest counts as followed.
         error_wz: rad/s, the same for yaw.
@@ -57,6 +59,7 @@ class GridConfig:
     straight: float = 0.25
     near: float = 0.2
     axis: float = 0.15
+    frontier: float = 0.5
     hold: tuple[float, float] = (2.0, 6.0)
     error_xy: float = 0.12
     error_wz: float = 0.12
@@ -141,14 +144,22 @@ class CommandGrid:
         along = np.where(kind > 1.0 - c.axis, rng.integers(3, size=n), -1)
         for axis in range(3):
             ids, (one, other) = np.flatnonzero(along == axis), {0, 1, 2} - {axis}
-            command[ids, axis] = self._draw_from(self._plane(one) & self._plane(other), rng, len(ids))[
+            command[ids] = 0.0
+            command[ids, axis] = self._draw_along(self._plane(one) & self._plane(other), rng, len(ids))[
                 :, axis
             ]
-            command[ids, one] = command[ids, other] = 0.0
         command[:, :3] = [self._limits.clamp(one) for one in command[:, :3].tolist()]
         still = rng.random(n) < c.stance
         command[still] = [0.0, 0.0, 0.0, 1.0]
         return command
+
+    def _draw_along(self, cells: np.ndarray, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Draw commands (n, 3) from open cells of an axis, more often from those not yet followed."""
+        drawn, new = self._draw_from(cells, rng, n), cells & ~self.followed
+        if new.any():
+            ids = np.flatnonzero(rng.random(n) < self.config.frontier)
+            drawn[ids] = self._draw_from(new, rng, len(ids))
+        return drawn
 
     def _plane(self, axis: int) -> np.ndarray:
         """Open cells whose middle is 0 on an axis."""
