@@ -41,8 +41,8 @@ def advance(clock: GaitClock, command: np.ndarray, speed: float = 0.0, stepped: 
 
 def test_steps_are_slow_at_rest_and_fast_and_short_on_the_ground_at_speed():
     velocity = np.array([[0.0, 0, 0], [0.5, 0, 0], [0, 0, 4.0], [-3.0, 0, 0], [4.2, 0, 0]])
-    assert step_frequency(velocity) == pytest.approx([1.9, 2.185, 2.584, 3.61, 4.294])
-    assert duty_factor(velocity) == pytest.approx([0.75, 0.71, 0.654, 0.51, 0.414])
+    assert step_frequency(velocity) == pytest.approx([1.9, 2.2275, 2.686, 3.865, 4.4])
+    assert duty_factor(velocity) == pytest.approx([0.75, 0.707, 0.6468, 0.492, 0.3888])
 
 
 def test_diagonal_feet_move_together_and_the_pairs_half_a_cycle_apart():
@@ -59,7 +59,7 @@ def test_the_plan_accelerates_to_the_command_and_its_clock_runs_at_that_frequenc
     for cycle in range(2, 13):
         advance(clock, WALK)
         velocity = min(4.0 * PERIOD * cycle, 1.0)
-        phase += PERIOD * (1.9 + 0.57 * velocity)
+        phase += PERIOD * (1.9 + 0.655 * velocity)
         assert clock.velocity[0] == pytest.approx([velocity, 0.0, 0.0])
     assert clock.phase[0] == pytest.approx(phase % 1.0)
 
@@ -142,12 +142,12 @@ def test_the_scripted_trot_alone_stands_and_follows_slow_commands_in_all_directi
     )
     env = VelocityEnv(attrs.evolve(config, ramped=0.0), FixedCommands(command))
     past, velocity = Past(env), []
-    for _ in range(150):
+    for _ in range(300):
         env.tick(env.stand_q + ACTION_SCALE * total_action(env, past, np.zeros((n, 12))))
         past.advance(command)
         velocity.append(np.concatenate([env.velocity[:, :2], env.angular_velocity[:, 2:]], axis=1))
         assert not env.fallen.any()
-    error = np.mean(velocity[50:], axis=0) - COMMANDS
+    error = np.mean(velocity[200:], axis=0) - COMMANDS
     assert np.hypot(error[:, 0], error[:, 1]).max() < 0.2
     assert np.abs(error[:, 2]).max() < 0.4
 

@@ -18,23 +18,23 @@ from .env import VelocityEnv
 from .gait_clock import GaitClock, duty_factor, step_frequency
 
 HEIGHT_M = 0.37  # of the trunk above ground
-CROUCH_M = 0.037  # by which the trunk is lower than in the nominal posture: longer steps are in reach
-LIFT_M = 0.095  # height of a swing
-LONGEST_STEP_M = 0.255  # way of a foot under the trunk in one stance
-LEAD_S = 0.054  # joints follow their targets so late
-PLACEMENT_S = np.array([0.137, 0.114])  # x, y: feet are placed this time times the excess velocity out,
-BEHIND_S = np.array([0.072, 0.034])  # this time times the planned velocity behind, which drives,
-DRAG = np.array([0.006, 0.0])  # s^2/m, this times its square behind, for what steps lose,
-CATCH_UP = 0.1  # and this share of the way that the robot lags behind its command
+CROUCH_M = 0.032  # by which the trunk is lower than in the nominal posture: longer steps are in reach
+LIFT_M = 0.104  # height of a swing
+LONGEST_STEP_M = 0.198  # way of a foot under the trunk in one stance
+LEAD_S = 0.077  # joints follow their targets so late
+PLACEMENT_S = np.array([0.085, 0.064])  # x, y: feet are placed this time times the excess velocity out,
+BEHIND_S = np.array([0.062, 0.034])  # this time times the planned velocity behind, which drives,
+DRAG = np.array([0.0028, 0.0])  # s^2/m, this times its square behind, for what steps lose,
+CATCH_UP = 0.063  # and this share of the way that the robot lags behind its command
 MAX_BEHIND = np.array([0.45, 2.0])  # m/s, planned velocity that counts
 MAX_EXCESS = 0.5  # m/s, excess velocity that counts
-CURVE = 0.73  # share of the acceleration in a curve for which feet are placed out
-YAW_GAIN = 0.5  # stances turn faster by this share of the excess yaw rate,
-TURN_S = 0.033  # and feet are turned about the trunk by this time times it
+CURVE = 0.87  # share of the acceleration in a curve for which feet are placed out
+YAW_GAIN = 0.52  # stances turn faster by this share of the excess yaw rate,
+TURN_S = 0.031  # and feet are turned about the trunk by this time times it
 MAX_YAW_EXCESS = 1.5  # rad/s, excess yaw rate that counts
-LEVELLING = np.array([1.04, 1.58])  # roll, pitch: share of the tilt that stance feet push back
-RATE_S = np.array([0.025, 0.088])  # time that a roll or pitch rate is extrapolated
-HEIGHT_GAIN = 0.57  # share of the height above HEIGHT_M by which stance feet of a walk give way,
+LEVELLING = np.array([1.2, 1.88])  # roll, pitch: share of the tilt that stance feet push back
+RATE_S = np.array([0.025, 0.08])  # time that a roll or pitch rate is extrapolated
+HEIGHT_GAIN = 0.54  # share of the height above HEIGHT_M by which stance feet of a walk give way,
 MAX_HEIGHT_ERROR_M = 0.1  # up to this error
 LOAD = 1.7  # share of the load of a stance foot that is fed forward
 
