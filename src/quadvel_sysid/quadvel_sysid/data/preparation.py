@@ -30,7 +30,7 @@ _AVERAGING_ROWS = np.array([1, 2, 4, 8])
 _MAX_AVERAGING_S = 0.0081
 """Longest half width of an average, s."""
 _MAX_AVERAGING_BLURRED_S = 0.0021
-"""The same if only friction shows the noise, s; longer averages would blur bristles and backlash."""
+"""The same if only friction shows the noise, s: longer ones blur bristles and backlash."""
 _FRICTION_WIDTHS_RAD_S = np.array([0.02, 0.06, 0.2])
 """Velocities w (rad/s) of the friction curves tanh(dq / w) that are fitted."""
 _MIN_AVERAGING_GAIN = 0.005
@@ -164,7 +164,7 @@ def _choose_averaging(
 
 
 def _error_with_friction(prepared: Preprocessed) -> float:
-    """Mean squared error of the plain model with friction, N^2 m^2; friction shows noise of dq most."""
+    """Mean squared error (N^2 m^2) of the EAM with friction, which shows noise of dq most."""
     samples, eam, rows = prepared.samples, prepared.eam, prepared.parts.fit
     dq = samples.at(eam.input_delay, eam.output_delay, eam.window).dq
     left, total = samples.tau - eam.predict(samples), 0.0
