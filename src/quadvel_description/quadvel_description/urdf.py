@@ -21,7 +21,7 @@ _ZERO = (0.0, 0.0, 0.0)
 
 
 def read_links(path: Path) -> list[dict[str, Any]]:
-    """Read the links below the root link, in the order of the file, which must list parents first.
+    """Read the links below the root link, in the order of their joints in the file.
 
     Args:
         path: URDF file.
