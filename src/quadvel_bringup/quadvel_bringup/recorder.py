@@ -34,7 +34,7 @@ MAX_OTHER_CALLBACKS = 4
 class Recorder:
     """Passes received messages to a sink.
 
-    Closing it closes the sink. On a full disk OSError passes through the executor.
+    Closing it closes the sink. If the disk is full, spinning the executor raises OSError.
 
     Args:
         node: The node that subscribes.
@@ -110,17 +110,18 @@ class Recorder:
     def write_waiting(self, executor: Executor, until: float = math.inf) -> None:
         """Write all waiting messages.
 
-        Other callbacks of the node, such as that of /clock, take turns with them.
+        The executor may run other callbacks of the node, such as that of /clock, in between. If
+        MAX_OTHER_CALLBACKS in a row bring no message, none is waiting.
 
         Args:
             executor: Executor of the node.
             until: Latest end on the monotonic clock, s; the rest stays for the next call.
         """
-        in_vain = 0
-        while in_vain < MAX_OTHER_CALLBACKS and time.monotonic() < until:
+        without_message = 0
+        while without_message < MAX_OTHER_CALLBACKS and time.monotonic() < until:
             written = self.counts.total()
             executor.spin_once(timeout_sec=0.0)
-            in_vain = 0 if self.counts.total() > written else in_vain + 1
+            without_message = 0 if self.counts.total() > written else without_message + 1
         self._keeper.settle()
 
     def close(self, finish: bool = True) -> None:

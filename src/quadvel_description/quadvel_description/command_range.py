@@ -1,8 +1,10 @@
 """Joint targets beyond the command range: a clipped target plus feed-forward torque (decision 18).
 
-A soft gain needs targets far from the joint to produce torque. At 30 N m/rad, targets within the
-range of a bent knee give about 24 N m, half of the available torque. The part of a target that lies
-beyond the range is therefore sent as feed-forward torque, so that the joint torque is the same.
+The command range holds the targets that the drives accept: `Robot.command_lower` and
+`command_upper`. With a small kp, only a target far from the joint gives much torque. At
+kp = 30 N m/rad, targets in the range of a bent knee give about 24 N m, half of the available
+torque. The excess of a target over the range, times kp, is therefore sent as feed-forward torque:
+the joint torque is the same.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from .arrays import Array
 from .robot import Robot
 
 STOP_STIFFNESS_NM_PER_RAD = 100.0
-"""Largest feed-forward torque toward a mechanical stop by the remaining distance to it."""
+"""Largest feed-forward torque toward a mechanical stop, per radian of distance to the stop."""
 
 
 def clip_to_command_range(robot: Robot, target: ArrayLike) -> Array:

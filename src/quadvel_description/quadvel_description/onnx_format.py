@@ -24,13 +24,13 @@ FLOAT32 = 1
 
 INT, FLOAT, TEXT, BYTES = "int", "float", "text", "bytes"
 OPAQUE = "opaque"
-"""Numbers that are written back byte for byte, in any encoding."""
+"""Numbers that are not decoded: kept and written back byte for byte."""
 UNREAD = "unread"
 """A message kept as bytes, so that `network_file` can refuse it."""
 WIRE_TYPES = {INT: 0, FLOAT: 5}
-"""Encoding of numbers: a varint, four bytes. All other kinds have 2: length and bytes."""
+"""Wire type of numbers: 0 is a varint, 5 four bytes. All other kinds have 2: length, then bytes."""
 FIXED_BYTES = {1: 8, 5: 4}
-"""Length of a value by its encoding."""
+"""Length of a value in bytes, by wire type."""
 
 
 @attrs.frozen
@@ -85,7 +85,7 @@ MESSAGES: dict[str, dict[int, Field]] = {
 
 
 class FormatError(ValueError):
-    """The bytes are no such message, or not a whole one."""
+    """The bytes are not a valid message, or end within one."""
 
 
 class TooManyValuesError(FormatError):
@@ -98,8 +98,8 @@ class Message:
 
     Attributes:
         kind: Its name in `MESSAGES`.
-        fields: Values of each field that occurs: int, float, str, bytes or `Message`; of a text
-            that is not UTF-8 the bytes; of OPAQUE fields the encoded field.
+        fields: Values of each field that occurs: int, float, str, bytes or `Message`. A text that
+            is not UTF-8 stays bytes; an OPAQUE field stays encoded.
     """
 
     kind: str
@@ -171,8 +171,8 @@ def float_value(name: str, shape: Sequence[int]) -> Message:
     """Create the description of an input or output of float32.
 
     Args:
-        name: Its name.
-        shape: Its shape.
+        name: Name of the input or output.
+        shape: Length of each dimension.
 
     Returns:
         The "ValueInfoProto".
@@ -186,8 +186,8 @@ def stored_tensor(name: str, values: NDArray[np.float32]) -> Message:
     """Create an initializer of float32.
 
     Args:
-        name: Its name.
-        values: Its numbers.
+        name: Name of the initializer.
+        values: The numbers, of any shape.
 
     Returns:
         The "TensorProto".
@@ -197,17 +197,17 @@ def stored_tensor(name: str, values: NDArray[np.float32]) -> Message:
 
 
 def parse(content: bytes) -> Message:
-    """Read a file.
+    """Read an ONNX file.
 
     Args:
-        content: Its bytes.
+        content: Content of the file.
 
     Returns:
         The "ModelProto".
 
     Raises:
         TooManyValuesError: It has more than MAX_VALUES values.
-        FormatError: It is no such file, or not a whole one.
+        FormatError: It is not an ONNX file, or is truncated.
     """
     return _Reader(content).message("ModelProto", 0, len(content))
 

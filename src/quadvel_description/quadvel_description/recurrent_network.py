@@ -1,7 +1,7 @@
 """ONNX network with LSTM memory and metadata, run step by step: policies and estimators.
 
-The file is checked by name against the caller's expectation. A step runs on one thread. A
-time-critical caller can compute a part of a step before the observation arrives, see `prepare`.
+Inputs, outputs and metadata of the file must match what the caller expects. A step runs on one
+thread. A time-critical caller can compute a part of it before the observation arrives: `prepare`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def open_session(path: Path, model: Message) -> onnxruntime.InferenceSession:
     """Open a session of a network, or of a part of it, that runs on one thread.
 
     Args:
-        path: Its file, for the error.
+        path: File of the network, for the error message.
         model: The network.
 
     Returns:
@@ -166,7 +166,7 @@ class RecurrentNetwork:
         self._memory_index, self._next_runs = 1 - self._memory_index, self._whole_runs
         result = self._result[0].copy()
         outputs = [result[place] for place in self._output_slices]
-        if not all(map(math.isfinite, result.tolist())):  # for so few numbers quicker than NumPy
+        if not all(map(math.isfinite, result.tolist())):  # faster than NumPy for so few numbers
             named = zip(self._outputs, outputs, strict=True)
             broken = next(name for name, output in named if not np.isfinite(output).all())
             raise FloatingPointError(f"{self.path}: the network's output {broken} is not finite")

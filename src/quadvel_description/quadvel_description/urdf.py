@@ -1,4 +1,7 @@
-"""Links and joints of a robot from its URDF file. No MuJoCo, so that a robot's computer can read it."""
+"""Links and joints of a robot from its URDF file, in SI units.
+
+It does not need MuJoCo, so that it runs on a robot's computer.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +14,21 @@ import numpy as np
 from .quadruped import JOINT_NAMES
 
 ROOT = "base_link"
-"""Root link of every URDF; it has no inertia."""
+"""Name of the root link. It is not read; the trunk, its child, has no parent."""
 
 _AXES: dict[tuple[float, ...], str] = {(1.0, 0.0, 0.0): "x", (0.0, 1.0, 0.0): "y"}
 _ZERO = (0.0, 0.0, 0.0)
 
 
 def read_links(path: Path) -> list[dict[str, Any]]:
-    """Read the links below the root link, parents before their children.
+    """Read the links below the root link, in the order of their joints in the file.
 
     Args:
         path: URDF file.
 
     Returns:
-        Fields of `robot.Link`, one mapping for each link.
+        Fields of `robot.Link`, one mapping for each link: origins in m, ranges in rad, masses in
+        kg, inertia tensors in kg m^2 about the centre of mass in the axes of the link.
 
     Raises:
         ValueError: The file is no URDF of a quadruped with twelve joints; the message names file,

@@ -2,7 +2,7 @@
 
 States and commands use this interface only. The ROS side offers the ground truth, the services of the
 simulation, and the topic `~/remote`. A joystick on that topic replaces the wireless remote: axes
-lx, ly, rx, ry, and the buttons in the order of their bits in the protocol.
+lx, ly, rx, ry (-1 to 1), and the buttons in the order of their bits in the protocol.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ STICK_AXES = ("lx", "ly", "rx", "ry")
 
 
 class BoardNode(SimulationNode[BoardParameters]):
-    """ROS node of a simulated robot behind its packets."""
+    """ROS node of a simulated robot that exchanges the packets of the real one."""
 
     def __init__(self) -> None:
         """Start the board and the simulation."""
@@ -60,7 +60,7 @@ class BoardNode(SimulationNode[BoardParameters]):
         return f"{new} packets dropped in the last second: {self._board.last_refusal}" if new else ""
 
     def _on_remote(self, message: Any) -> None:
-        """Take axes and buttons of a joystick as state of the wireless remote."""
+        """Use axes and buttons of a joystick as the state of the wireless remote."""
         axes, buttons = [*message.axes, 0.0, 0.0, 0.0, 0.0], message.buttons[: len(Button)]
         pressed = sum(bit for bit, is_down in zip(Button, buttons, strict=False) if is_down)
         self._board.remote = Remote(Button(pressed), **dict(zip(STICK_AXES, axes, strict=False)))

@@ -1,7 +1,7 @@
 """Parallel map over forked worker processes, with the results of a serial run.
 
-A worker is a fork of this process and therefore shares its data. Results return by pickle, without
-one large object that this process holds already.
+A worker is a fork of this process and therefore has its data. Results return by pickle, in which a
+name replaces the object `shared`: both processes have it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """viser's server on a Unix socket in a private folder, without a TCP port.
 
 viser answers all clients, and a ShareUrlRequest message makes it open a tunnel to a public address.
-Browsers cannot connect to a Unix socket: the page's server checks access, forwards the scene, and
-forwards nothing to viser.
+Browsers cannot connect to a Unix socket, so they get the scene from the page's server (`server`).
+That server checks access, and drops what browsers send to viser.
 
 This relies on viser's start-up calling `websockets.asyncio.server.serve` once, so pyproject.toml
 pins viser to one minor version. If the call is missing, the scene is refused.
@@ -30,7 +30,7 @@ _starting = Lock()
 
 
 class SceneServerError(RuntimeError):
-    """viser cannot be isolated from the network; one sentence."""
+    """viser cannot be isolated from the network; the message is one sentence."""
 
 
 class SceneServer:

@@ -1,6 +1,11 @@
 """Dynamic effects: lags and filters in the drive, rotor inertia, and time stamps that are off.
 
-`base` defines the interface, and `recurrence` computes the filters step by step.
+`base` defines the interface; in short: `s` holds signals (q in rad, dq in rad/s, dt in s), `p`
+parameters. At stage ERRORS, `x` is the pair of errors of the PD law: q_des - q (rad) and
+dq_des - dq (rad/s). At stage DYNAMICS it is the torque, N m. An `AddedEffect` returns the torque to
+add, N m. A `MemoryEffect` reads the signals `u` that `inputs` names.
+
+`recurrence` computes the filters step by step.
 """
 
 from __future__ import annotations
@@ -107,9 +112,9 @@ class FirstOrderLag(MemoryEffect):
     @override
     def series(self, x: Any, s: Any, p: Params) -> Any:
         """Apply the lag to a series, with commands that arrive within a step."""
-        # A new command may arrive within a step, `age` ago; until then the lag follows the torque
-        # before.
-        # Both parts together equal a constant input before + w (x - before), with
+        # A new command may arrive within a step, `age` (s) before its end. Until then the lag
+        # follows the previous torque. Both parts together equal a constant input
+        # before + w (x - before), with
         #     w = (1 - exp(-age / T)) / (1 - exp(-dt / T))
         before, gone = _previous_row(x, s), _decay(s.dt, p["T"])
         late = _decay(np.minimum(s.age, s.dt), p["T"]) / gone
@@ -164,9 +169,10 @@ class Armature(AddedEffect):
 class TimestampSkew(ErrorEffect):
     """Time skew: `q` or `dq` reaches the drive `late` s later than its rows say.
 
-    It is earlier if `late` is negative. The command keeps its time, so a position that is early on
-    some joints is no velocity that is late there. In a running model a late channel is a delay of
-    the measurement. An early one is a fault of the log alone and is ignored.
+    If `late` is negative, it arrives earlier. An early `q` on all joints equals a late `dq` with
+    other delays. On some joints it does not, because the delays are common to all joints. In a
+    running model, a late channel is a delay of the measurement. An early one is a fault of the log
+    alone and is ignored.
 
     Attributes:
         channel: `dq` or `q`.

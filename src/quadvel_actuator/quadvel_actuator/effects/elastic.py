@@ -1,6 +1,11 @@
 """Effects of position: offset, spring, cogging, deadband, backlash and hysteresis.
 
-`base` defines the interface, and `recurrence` computes backlash and hysteresis step by step.
+`base` defines the interface; in short: `s` holds signals (q in rad, dq in rad/s), `p` parameters.
+An `AddedEffect` returns the torque to add, N m. An `ErrorEffect` changes the errors of the PD law:
+e[0] = q_des - q (rad) and e[1] = dq_des - dq (rad/s). A `MemoryEffect` receives `x`, the errors or
+the torque, and the signals `u` that `inputs` names.
+
+`recurrence` computes backlash and hysteresis step by step.
 """
 
 from __future__ import annotations

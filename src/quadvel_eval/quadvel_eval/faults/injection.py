@@ -276,14 +276,14 @@ def _pausing(name: str) -> Callable[[Stack, Rng], None]:
     """Stop a process for PAUSE_MS in every three periods of PAUSE_MS."""
 
     def begin(stack: Stack, rng: Rng) -> None:
-        process, report = stack.processes[name], stack.sensor_fault
+        process, earlier_fault = stack.processes[name], stack.sensor_fault
 
         def pause(now: int, state: RobotState) -> RobotState:
             if now // PAUSE_MS % 3 == 0:
                 process.stopped = True
             elif process.stopped:
                 process.resume()
-            return state if report is None else report(now, state)
+            return state if earlier_fault is None else earlier_fault(now, state)
 
         stack.sensor_fault = pause
 

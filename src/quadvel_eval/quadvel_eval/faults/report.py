@@ -1,6 +1,6 @@
 """Writes the result of the fault campaign as JSON, table and picture.
 
-`campaign` runs the cases and judges them; nothing is judged here.
+`campaign` runs and judges the cases.
 """
 
 from __future__ import annotations
@@ -28,6 +28,13 @@ from .campaign import (
 )
 
 Entries = Sequence[dict[str, Any]]
+"""Summaries of the cases by `campaign.summarise_cases`.
+
+`named_after` and `safe_after` are the median and the largest time (s) from the fault to the first
+expected finding, and to the expected end. `torque` and `speed` are the largest ratios to the
+drive's limit, and `beyond` is the largest overtravel, rad. `named` lists the expected findings that
+occurred, and `wrong` the violations.
+"""
 
 
 def write_campaign(folder: Path, runs: Sequence[FaultRun]) -> dict[str, Any]:

@@ -108,8 +108,8 @@ def _second_rows(grid: str, records: Sequence[Record]) -> list[Row]:
     """Rows of one grid on the second plant, within the policies' limits."""
     where = f"{grid} grid, second plant"
     return [
-        Row(f"{where}: runs", "", None, by_policy(records, len), 0),
-        Row(f"{where}: falls", "", 0.0, by_policy(records, count_falls), 0, key=True),
+        Row(f"{where}: runs", "", None, by_policy(records, len), digits=0),
+        Row(f"{where}: falls", "", 0.0, by_policy(records, count_falls), digits=0, key=True),
         Row(f"{where}: mean error", "m/s", None, by_policy(records, mean_error), key=True),
         Row(f"{where}: largest error", "m/s", None, by_policy(records, largest_error), key=True),
         *_turn_rows(where, records),
@@ -142,12 +142,12 @@ def _rows(grid: str, records: Sequence[Record]) -> list[Row]:
     every, inside = f"{grid} grid, all", f"{grid} grid, within the policy's limits"
     within_limits = select(records, within=1)
     return [
-        Row(f"{every}: runs", "", None, by_policy(records, len), 0),
-        Row(f"{every}: falls", "", 0.0, by_policy(records, count_falls), 0, key=True),
+        Row(f"{every}: runs", "", None, by_policy(records, len), digits=0),
+        Row(f"{every}: falls", "", 0.0, by_policy(records, count_falls), digits=0, key=True),
         Row(f"{every}: mean error", "m/s", None, by_policy(records, mean_error), key=True),
         Row(f"{every}: largest error", "m/s", paper, by_policy(records, largest_error), key=True),
-        Row(f"{inside}: runs", "", None, by_policy(within_limits, len), 0),
-        Row(f"{inside}: falls", "", 0.0, by_policy(within_limits, count_falls), 0),
+        Row(f"{inside}: runs", "", None, by_policy(within_limits, len), digits=0),
+        Row(f"{inside}: falls", "", 0.0, by_policy(within_limits, count_falls), digits=0),
         Row(f"{inside}: mean error", "m/s", None, by_policy(within_limits, mean_error), key=True),
         Row(f"{inside}: largest error", "m/s", paper, by_policy(within_limits, largest_error), key=True),
         *_turn_rows(inside, within_limits),

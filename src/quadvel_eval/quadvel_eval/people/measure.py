@@ -172,7 +172,7 @@ def scene_scores(
     for seed in seeds:
         scene = make(seed)
         tracker = PersonTracker(detector=detector)
-        first: dict[int, int] = {}
+        first: dict[int, int] = {}  # track id by person: of the first match, and of the last scan
         now: dict[int, int] = {}
         ghost_ids: set[int] = set()
         for instant in scene.scans():

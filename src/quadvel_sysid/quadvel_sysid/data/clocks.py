@@ -1,7 +1,7 @@
 """Clocks of recordings: jittering stamps, and the offset between the clocks of states and commands.
 
-Both belong to a recording, not to the robot. They are fitted as nuisance parameters, on rows of the
-recording that are not reported.
+Both belong to a recording, not to the robot. They are chosen by the torque error of the plain model
+(`plain_model`: PD gains and two delays), on rows that do not enter the reported error.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class RecordingClock:
     Attributes:
         log: Name of the recording.
         heldout: Whether it is held out.
-        even: Whether the even clock of the sender replaces jittering stamps.
+        even: Whether evenly spaced stamps, as the sender's clock gave them, replace jittering ones.
         offset_s: Delay of its commands relative to the mean of the fitted recordings, s; its command
             stamps were shifted by it. None if commands and states have the same stamps.
         half_width_s: Half width of the 95 % interval of the offset, s.
@@ -68,12 +68,12 @@ def choose_stamps(
 ) -> tuple[Dataset, list[RecordingClock]]:
     """Decide for each recording whether jittering stamps are replaced by those of an even clock.
 
-    The null hypothesis is that both stamps predict the torque equally well. A one-sided t test over
-    clusters of rows rejects it at the level 0.01, from the recording's own rows.
+    They are replaced if the plain model then predicts the recording's torque significantly better,
+    in a one-sided t test over clusters of its rows at the level 0.01.
 
     Args:
         dataset: The logs.
-        windows: Steps (s) of the drive that the plain model tries.
+        windows: Windows (s) to try in the plain model, over which the drive averages commands.
         length: Length of the blocks of rows, s.
         options: Options of the search.
 
@@ -101,17 +101,17 @@ def align_commands(
     """Shift the command stamps of each recording by the offset between its clocks.
 
     Total delays differ between recordings of one robot, as states and commands are stamped by
-    different computers. The plain model of the fitted recordings defines the mean offset, 0.
+    different computers. Offsets are relative to the mean of the fitted recordings.
 
     Args:
         dataset: The logs.
         clocks: Clock of each recording.
-        windows: Steps (s) of the drive that the plain model tries.
+        windows: Windows (s) to try in the plain model, over which the drive averages commands.
         length: Length of the blocks of rows, s.
 
     Returns:
-        The aligned logs, and the clocks with their offsets. An offset within its interval is kept in
-        the clock, but no stamp is shifted by it.
+        The aligned logs, and the clocks with their offsets. If the 95 % interval of an offset
+        contains 0, the clock states the offset, but no stamp is shifted by it.
     """
     if len(clocks) < 2 or not all(log.has_own_command_stamps for log in dataset.logs):
         return dataset, list(clocks)
@@ -197,7 +197,7 @@ def _fitted_eam(dataset: Dataset, windows: Sequence[float], length: float) -> Ea
 
 
 def _offset(dataset: Dataset, recording: int, eam: Eam, length: float) -> tuple[float, float]:
-    """Extra delay (s) of a recording's commands beyond a model's, and its 95 % half width."""
+    """Delay (s) of the commands beyond the model's input delay, and its 95 % half width."""
     samples = Samples.of([dataset.logs[k] for k in dataset.pieces[recording]])
     rows, starts = _own_rows(dataset, recording, samples, length), cluster_starts(samples)
 

@@ -13,10 +13,10 @@ from .signals import Samples
 def noise_variance(samples: Samples, rows: Bools, residual: Array) -> Array:
     """Estimate the variance of the torque noise from differences of consecutive rows.
 
-    A smooth torque hardly contributes to differences of order 2 to 5. Step commands do, so that the
-    residual of a model is differenced as well and the smaller estimate counts. The quantisation
-    noise D^2 / 12 of a torque with the resolution D is a lower bound. A joint with a constant
-    torque gets the mean of the other joints.
+    A smooth torque adds little to differences of order 2 to 5, but steps of the command add much. A
+    model explains most of these steps. Its residual is therefore differenced too, and the smaller
+    estimate counts. The quantisation noise D^2 / 12 of a torque with the resolution D is a lower
+    bound. A joint with a constant torque gets the mean of the other joints.
 
     Args:
         samples: Rows of all logs.

@@ -1,8 +1,7 @@
-"""Preprocess logs: choose time stamps and the smoothing of q and dq that explain the torque best.
+"""Preprocess logs: choose the time stamps and the averaging of q and dq that fit the torque best.
 
-The choice is the one that explains the torque best. If the drive acted on noisy encoders, their
-noise is in its torque and the measurements stay as they are. If it did not, the noise is averaged
-out before anything is fitted, because an effect could otherwise be fitted to it.
+If the drive acted on the noise of its encoders, the torque contains this noise, and q and dq stay
+as they are. If not, the noise is averaged out first; otherwise an effect could be fitted to it.
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ _ENCODER_NOISE_SHARE = 0.01
 """Encoders are noisy if their noise adds at least this share of the torque's noise variance."""
 _AVERAGING_ROWS = np.array([1, 2, 4, 8])
 """Rows to either side over which q and dq may be averaged."""
-_MAX_AVERAGING_S, _MAX_AVERAGING_BLURRED_S = 0.0081, 0.0021
-"""s; longest averages, in general and if only friction shows the noise: bristles and backlash act on
-the time scale of the longer ones.
-"""
+_MAX_AVERAGING_S = 0.0081
+"""Longest half width of an average, s."""
+_MAX_AVERAGING_BLURRED_S = 0.0021
+"""The same if only friction shows the noise, s: longer ones blur bristles and backlash."""
 _FRICTION_WIDTHS_RAD_S = np.array([0.02, 0.06, 0.2])
-"""rad/s; widths of the smooth step of friction that are fitted."""
+"""Velocities w (rad/s) of the friction curves tanh(dq / w) that are fitted."""
 _MIN_AVERAGING_GAIN = 0.005
 """Share of the noise variance by which each wider average has to reduce the error."""
 
@@ -61,16 +60,16 @@ def preprocess(
     shortest: float = MIN_BLOCK_S,
     options: SearchOptions = SEARCH_DEFAULTS,
 ) -> tuple[Preprocessed, list[tuple[str, Finding]]]:
-    """Correct the clocks of each recording, and choose the averaging that explains the torque best.
+    """Correct the clocks of each recording, then choose how far q and dq are averaged.
 
     Args:
         dataset: The logs.
-        windows: Steps (s) of the drive that the plain model tries.
+        windows: Windows (s) to try in the plain model, over which the drive averages commands.
         shortest: Shortest block, s.
         options: Options of the search.
 
     Returns:
-        The preprocessed logs, and a note for each choice other than the logs as they are.
+        The preprocessed logs, and a note for each correction, as (log name, finding).
     """
     length = block_length(dataset, shortest)
     dataset, clocks = choose_stamps(dataset, windows, length, options)
@@ -149,7 +148,7 @@ def _choose_averaging(
     noisy = (kp**2 * q_noise + kd**2 * dq_noise).mean() >= _ENCODER_NOISE_SHARE * noise
 
     def error_of(prepared: Preprocessed) -> float:
-        """Error with friction; relative to the error without it if noise hardly affects the PD law."""
+        """Error with friction, N^2 m^2; unless `noisy`, minus the error of the PD law alone."""
         return _error_with_friction(prepared) - (0.0 if noisy else prepared.eam.mse)
 
     chosen, least = 0.0, error_of(prepared)
@@ -165,7 +164,7 @@ def _choose_averaging(
 
 
 def _error_with_friction(prepared: Preprocessed) -> float:
-    """Mean squared error of the plain model with friction, whose step noisy speeds blur most."""
+    """Mean squared error (N^2 m^2) of the EAM with friction, which shows noise of dq most."""
     samples, eam, rows = prepared.samples, prepared.eam, prepared.parts.fit
     dq = samples.at(eam.input_delay, eam.output_delay, eam.window).dq
     left, total = samples.tau - eam.predict(samples), 0.0

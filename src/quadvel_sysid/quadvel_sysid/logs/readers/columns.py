@@ -1,4 +1,6 @@
-"""Names of a log's fields in a file: their own, aliases of other tools, or those of a map file.
+"""Read the fields of a log from a file, whatever its columns are called.
+
+A column counts as a field if it has its name or an alias (`names`), or if a map file says so.
 
 A map file is YAML with one line for each field that has another name:
 
@@ -160,49 +162,54 @@ def read_fields(path: Path, names: ColumnMap) -> tuple[dict[str, Floats], list[s
         names: The map of columns.
 
     Returns:
-        Arrays by field in SI units; names of the joints, or None if not found; remarks about what
-        was assumed.
+        Arrays by field in SI units, (N,) or (N, J), a constant () or (J,); names of the joints, or
+        None if not found; remarks about what was assumed.
     """
     fields: dict[str, Floats] = {}
     remarks: list[str] = []
     joints: list[str] | None = list(names.joints) or None
     places = dict.fromkeys([path, *(source.file_of(path) for source in names.sources.values())])
     for place in places:
-        mine = {name: one for name, one in names.sources.items() if one.file_of(path) == place}
-        plain = place == path
-        raw = files.read_file(place, partial(_choose_columns, plain, mine))
+        sources = {name: one for name, one in names.sources.items() if one.file_of(path) == place}
+        is_log_file = place == path
+        raw = files.read_file(place, partial(_choose_columns, is_log_file, sources))
         remarks += raw.remarks
-        if plain and joints is None and JOINT_NAMES_FIELD in raw.arrays:
+        if is_log_file and joints is None and JOINT_NAMES_FIELD in raw.arrays:
             joints = [str(name).strip() for name in np.ravel(raw.arrays[JOINT_NAMES_FIELD])]
-        for name, source in mine.items():
+        for name, source in sources.items():
             if source.value is not None:
                 fields[name] = np.asarray(source.value, dtype=float)
             elif source.columns:
                 columns, own = _mapped_columns(place, name, source.columns, raw, joints)
                 fields[name] = _stack_columns(place, name, columns, raw, source.scale)
                 joints = joints or (own if name == "q" else None)
-        if plain:
+        if is_log_file:
             joints = _add_unmapped(place, raw, names, fields, joints, remarks)
     return fields, joints, remarks
 
 
-def _choose_columns(plain: bool, sources: Mapping[str, Source], there: Sequence[str]) -> dict[str, str]:
-    """Select the columns that are needed, each with its field."""
+def _choose_columns(
+    is_log_file: bool, sources: Mapping[str, Source], available: Sequence[str]
+) -> dict[str, str]:
+    """Select the columns that are needed, each with its field.
+
+    Fields without an entry in the map file are read from the log's own file only.
+    """
     chosen: dict[str, str] = {}
     for field, source in sources.items():
         for column in source.columns:
-            chosen |= {name: field for name in there if name == column or name.startswith(f"{column}/")}
-    if plain:
-        for field, columns in _unmapped_columns(there, sources).items():
+            chosen |= {name: field for name in available if name == column or name.startswith(f"{column}/")}
+    if is_log_file:
+        for field, columns in _unmapped_columns(available, sources).items():
             chosen |= {name: field for name in columns.values() if name not in chosen}
-        chosen |= {JOINT_NAMES_FIELD: JOINT_NAMES_FIELD} if JOINT_NAMES_FIELD in there else {}
+        chosen |= {JOINT_NAMES_FIELD: JOINT_NAMES_FIELD} if JOINT_NAMES_FIELD in available else {}
     return chosen
 
 
-def _unmapped_columns(there: Sequence[str], sources: Mapping[str, Source]) -> dict[str, dict[str, str]]:
-    """Columns of the fields without an entry; a column that an entry uses holds nothing else."""
+def _unmapped_columns(available: Sequence[str], sources: Mapping[str, Source]) -> dict[str, dict[str, str]]:
+    """Columns by field and joint, for fields without an entry; columns of an entry are left out."""
     used = {column for one in sources.values() if one.file is None for column in one.columns}
-    free = [name for name in there if name not in used and name.partition("/")[0] not in used]
+    free = [name for name in available if name not in used and name.partition("/")[0] not in used]
     return {field: columns for field, columns in resolve_columns(free).items() if field not in sources}
 
 
@@ -214,7 +221,7 @@ def _add_unmapped(
     joints: list[str] | None,
     remarks: list[str],
 ) -> list[str] | None:
-    """Add the fields without an entry, by own name or alias; return the joints that q names."""
+    """Add the fields without an entry, by own name or alias; return the names of the joints."""
     used = {column for one in names.sources.values() if one.file is None for column in one.columns}
     found = _unmapped_columns([*raw.arrays, *raw.others], names.sources)
     for field, columns in found.items():

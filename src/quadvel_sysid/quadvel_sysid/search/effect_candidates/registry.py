@@ -1,8 +1,11 @@
-"""Candidates of the effects of the registry, by name.
+"""Actuator effects that the search may add to a model, each with its `EffectCandidate`.
 
-Another package adds a candidate of its effect through an entry point of the group
-`quadvel.effect_candidates`: the name of the effect, and an `EffectCandidate`. Without one, the
-defaults of `EffectCandidate` apply.
+The registry of `quadvel_actuator` holds the physics of an effect. A subclass of `EffectCandidate`
+holds what the search needs to find it in a log: forms (settings) to try and starting values.
+
+Another package names the subclass for its effect in an entry point of the group
+`quadvel.effect_candidates`: the name of the effect, and the class. Without one, the defaults of
+`EffectCandidate` apply.
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ def candidate_classes() -> dict[str, type[EffectCandidate]]:
         Candidate classes by the name of the effect, in the order of the registry.
 
     Raises:
-        ValueError: An entry point names no `EffectCandidate`, an unknown effect, or one of ours.
+        ValueError: An entry point names no `EffectCandidate`, an unknown effect, or an effect that
+            has a candidate class in quadvel.
     """
     own = {
         effect.name: candidate
@@ -48,14 +52,14 @@ def candidate_classes() -> dict[str, type[EffectCandidate]]:
 
 
 def effect_candidates(context: FormContext, without: Collection[str]) -> Iterator[EffectCandidate]:
-    """Iterate over the effects of the registry that a model lacks.
+    """Iterate over the forms of all effects that a model lacks.
 
     Args:
-        context: Data of the log.
+        context: Samples and signals of the logs, from which an effect chooses its forms.
         without: Names of the effects that the model has already.
 
     Yields:
-        Each effect in all its forms.
+        One candidate for each form of each effect.
     """
     for name, candidate in candidate_classes().items():
         if name not in without:
