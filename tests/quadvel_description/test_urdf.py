@@ -1,5 +1,7 @@
 """Tests that the URDF equals the MJCF; MuJoCo reads both."""
 
+from collections.abc import Callable
+from pathlib import Path
 from xml.etree import ElementTree
 
 import mujoco
@@ -11,6 +13,7 @@ from quadvel_description.frames import BASE
 from quadvel_description.quadruped import JOINT_NAMES, LEGS
 from quadvel_description.robot import Robot, load_robot
 from quadvel_description.robot_name import shipped_robots
+from quadvel_description.urdf import read_links
 from quadvel_description.urdf_generator import generate_folder_urdf
 
 KEEP_FIXED_LINKS = '<mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
@@ -124,3 +127,39 @@ def test_the_urdf_of_the_go2_is_the_generated_one():
     assert go2.urdf_file.read_text() == generate_folder_urdf(go2.folder), (
         "python -m quadvel_description.urdf_generator"
     )
+
+
+def _joints_changed(robot: Robot, folder: Path, change: Callable[[list[ElementTree.Element]], None]) -> Path:
+    """Write the robot's URDF with other joints."""
+    tree = ElementTree.parse(robot.urdf_file)
+    root, joints = tree.getroot(), tree.getroot().findall("joint")
+    for joint in joints:
+        root.remove(joint)
+    change(joints)
+    root.extend(joints)
+    tree.write(folder / "robot.urdf")
+    return folder / "robot.urdf"
+
+
+def test_joints_are_read_in_any_order_and_parents_come_first(robot, tmp_path):
+    links = read_links(_joints_changed(robot, tmp_path, list.reverse))
+    names = [link["name"] for link in links]
+    assert sorted(names) == sorted(link.name for link in robot.links)
+    assert all(link["parent"] is None or link["parent"] in names[:i] for i, link in enumerate(links))
+
+
+def test_the_order_of_a_file_whose_parents_come_first_is_kept(robot):
+    assert [link["name"] for link in read_links(robot.urdf_file)] == [link.name for link in robot.links]
+
+
+@pytest.mark.parametrize(
+    ("element", "link"), [("parent", "FR_calf"), ("parent", "nothing"), ("child", "FL_thigh")]
+)
+def test_links_in_a_circle_without_a_parent_or_with_two_are_refused(robot, tmp_path, element, link):
+    def wrong(joints: list[ElementTree.Element]) -> None:
+        joint = next(joint for joint in joints if joint.get("name") == "FR_hip_joint")
+        joint.find(element).set("link", link)
+
+    path = _joints_changed(robot, tmp_path, wrong)
+    with pytest.raises(ValueError, match=str(path)):
+        read_links(path)

@@ -21,7 +21,7 @@ _ZERO = (0.0, 0.0, 0.0)
 
 
 def read_links(path: Path) -> list[dict[str, Any]]:
-    """Read the links below the root link, in the order of their joints in the file.
+    """Read the links below the root link, in the order of their joints in the file, parents first.
 
     Args:
         path: URDF file.
@@ -56,7 +56,28 @@ def read_links(path: Path) -> list[dict[str, Any]]:
             f"{path}: joints that move: found {', '.join(strange)} missing or too many, "
             f"expected {', '.join(JOINT_NAMES)}"
         )
-    return links
+    return _parents_first(links, path)
+
+
+def _parents_first(links: list[dict[str, Any]], path: Path) -> list[dict[str, Any]]:
+    """Move links behind their parents; a file may state its joints in any order."""
+    names = [link["name"] for link in links]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{path}: link {name}: found {names.count(name)} joints above it, expected one")
+    placed: dict[str, dict[str, Any]] = {}
+    while len(placed) < len(links):
+        before = len(placed)
+        for link in links:
+            if link["parent"] is None or link["parent"] in placed:
+                placed.setdefault(link["name"], link)
+        if len(placed) == before:
+            lost = next(link for link in links if link["name"] not in placed)
+            raise ValueError(
+                f"{path}: link {lost['name']}: found parent {lost['parent']!r}, "
+                f"expected a chain of links from {ROOT}"
+            )
+    return list(placed.values())
 
 
 def _numbers(element: ElementTree.Element | None, name: str, size: int = 3) -> tuple[float, ...]:
