@@ -316,7 +316,7 @@ def test_the_grid_hears_how_robots_of_all_processes_followed(monkeypatch, grid):
     command, fell = np.array([[1.0, 0, 0, 0], [0.5, 0, 0, 0]]), np.zeros(2, bool)
     mine, other = CommandScorer(2), CommandScorer(2)
     for _ in range(100):
-        other.advance(np.zeros((2, 3)), 0.02)
+        other.advance(np.zeros((2, 3)), np.ones(2, bool), 0.02)
     other.finish(command, np.ones(2, bool), fell)
     monkeypatch.setattr(process_group, "gather", lambda own: [own, other._over])
     mine.report_to(grid)

@@ -316,7 +316,7 @@ class ConstrainedRun:
             row = (obs, critic_obs, standing, action, mean, reward, fell, late, alive.copy(), *label)
             for name, value in zip(names, row, strict=True):
                 keep[name].append(value)
-            self.scorer.advance(velocity_error(env, command), TICK_S)
+            self.scorer.advance(velocity_error(env, command), past.settled, TICK_S)
             self.scorer.finish(command, (fell | late | env.changed) & alive, fell)
             alive &= ~(fell | late)
         self.scorer.report_to(self.grid)

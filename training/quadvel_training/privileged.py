@@ -44,7 +44,7 @@ ACTION_BOUND = 4.0  # in the network's unit
 STRIDE_S = 0.35  # time constant of stride errors: about a stride
 LASTING_S = 1.5  # time constant of lasting errors
 MAX_LAG_M = 0.4  # a robot that does not follow is not to make up for more later
-TRANSIENT_S = 1.0  # after a new command, not part of lasting errors and scores
+TRANSIENT_S = 1.0  # after the plan has reached a command, not part of lasting errors and scores
 STANDING_S = 0.2  # on four feet; after that, setting off means choosing a side
 WALKING_HEIGHT_M = 0.38  # typical height of the trunk
 
@@ -83,8 +83,8 @@ class Past:
         env: environments.
         stride: (n, 3), command minus velocity in vx, vy (m/s) and yaw rate (rad/s), low-passed over
             `STRIDE_S`.
-        lasting: (n, 3), the same over `LASTING_S`; set to zero by a new command, it starts when the
-            plan has had the commanded velocity for `TRANSIENT_S`.
+        lasting: (n, 3), the same over `LASTING_S`; set to zero by a new command, it changes while
+            the robot is `settled`.
         lag: (n, 2), m, the integral of the error in vx and vy, over the same time as `lasting`.
         air: (n, 4), s since the foot left the ground; 0 on the ground.
         down: (n, 4), s since the foot touched the ground; 0 in the air.
@@ -129,7 +129,7 @@ class Past:
         error = velocity_error(env, command)
         self.stride += (error - self.stride) * period / STRIDE_S
         self._age += period * (self.clock.velocity == command[:, :3]).all(axis=1)
-        settled = (self._age > TRANSIENT_S)[:, None]
+        settled = self.settled[:, None]
         self.lasting += (error - self.lasting) * settled * period / LASTING_S
         self.lag = np.clip(self.lag + error[:, :2] * settled * period, -MAX_LAG_M, MAX_LAG_M)
         self.lag[env.changed] = 0.0
@@ -147,6 +147,11 @@ class Past:
         self._landed = np.where(contact & ~was_down, ahead, self._landed)
         self.off_hip = np.where(was_down & ~contact, 0.5 * (self._landed + self._last), 0.0)
         self._last = np.where(contact, ahead, self._last)
+
+    @property
+    def settled(self) -> np.ndarray:
+        """Whether the plan has had the commanded velocity for `TRANSIENT_S`, (n,) bool."""
+        return np.asarray(self._age > TRANSIENT_S)
 
     @property
     def standing(self) -> np.ndarray:
@@ -301,7 +306,7 @@ ScoredCommands = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class CommandScorer:
-    """Mean error of each robot under its present command, from `TRANSIENT_S` after its start on."""
+    """Mean error of each robot under its present command, while it is `Past.settled`."""
 
     def __init__(self, n: int) -> None:
         """Create a scorer of commands that start now.
@@ -309,18 +314,19 @@ class CommandScorer:
         Args:
             n: number of robots.
         """
-        self._sum, self._age = np.zeros((n, 3)), np.zeros(n)
+        self._sum, self._judged = np.zeros((n, 3)), np.zeros(n)  # of the error, s
         self._over: list[ScoredCommands] = []
 
-    def advance(self, error: np.ndarray, period: float) -> None:
+    def advance(self, error: np.ndarray, settled: np.ndarray, period: float) -> None:
         """Add the errors of one sample.
 
         Args:
             error: (n, 3), m/s and rad/s.
+            settled: (n,) bool, robots whose error counts.
             period: s, duration of the sample.
         """
-        self._age += period
-        self._sum += error * period * (self._age > TRANSIENT_S)[:, None]
+        self._judged += period * settled
+        self._sum += error * period * settled[:, None]
 
     def take(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the scores of commands that end, and start new ones.
@@ -331,9 +337,9 @@ class CommandScorer:
         Returns:
             Mean errors (len, 2) in xy (m/s) and yaw (rad/s), and the scored time, s.
         """
-        judged = np.maximum(self._age[ids] - TRANSIENT_S, 0.0)
+        judged = self._judged[ids]
         mean = self._sum[ids] / np.maximum(judged, 1e-6)[:, None]
-        self._sum[ids], self._age[ids] = 0.0, 0.0
+        self._sum[ids], self._judged[ids] = 0.0, 0.0
         return np.stack(error_magnitudes(mean), axis=1), judged
 
     def finish(self, command: np.ndarray, over: np.ndarray, fell: np.ndarray) -> None:
@@ -488,7 +494,7 @@ class PrivilegedRun:
             command = env.command.copy()
             env.tick(env.stand_q + ACTION_SCALE * action)
             self.past.advance(command)
-            self.scorer.advance(velocity_error(env, command), SAMPLE_S)
+            self.scorer.advance(velocity_error(env, command), self.past.settled, SAMPLE_S)
             parts = self.rewards.terms(command, self.past, np.stack([action, *self._actions]))
             reward = self.rewards.total(parts, env.fallen)
             self._actions = np.concatenate([action[None], self._actions[:-1]])
