@@ -10,7 +10,8 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_description.quadruped import joint_index  # noqa: E402
 from quadvel_eval.gait_kind import GaitKind  # noqa: E402
-from quadvel_training import teacher_walks  # noqa: E402
+from quadvel_training import loop, teacher_walks  # noqa: E402
+from quadvel_training.__main__ import app  # noqa: E402
 from quadvel_training.command_grid import CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.gait_clock import duty_factor  # noqa: E402
@@ -161,3 +162,13 @@ def test_the_kind_of_gait_is_logged_at_each_speed_with_each_numbered_checkpoint(
     fell = ["1 of 1 fell" in line for line in lines]
     assert len(figures) == (len(attrs.fields(GaitKind)) + 1) * fell.count(False)
     assert (tmp_path / "kept" / "000000k.pt").is_file()
+
+
+def test_a_teacher_walks_at_every_command_of_the_table(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(teacher_walks, "WALK_S", 0.2)
+    monkeypatch.setattr(teacher_walks, "MEASURED_S", 0.1)
+    loop.save(PrivilegedRun(PrivilegedConfig(n=6, threads=1, length=4)).state(), tmp_path / "privileged.pt")
+    app(["walks", "--teacher", str(tmp_path / "privileged.pt"), "--robots", "2"], standalone_mode=False)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(teacher_walks.TABLE_COMMANDS)
+    assert all("0 of 2 fell" in line for line in lines)
