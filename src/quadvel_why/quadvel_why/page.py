@@ -38,8 +38,9 @@ The answer is one cause: the first that is found. Later ones may be its conseque
 examined. Repair it, record again and ask again. If two causes look the same in the recording, both
 are named, with the experiment that distinguishes them.
 
-A recording of this stack holds everything. Of another robot's `LowState` and `LowCmd`, or of a table,
-only the causes are examined that need no kinematics and no policy; the answer lists the others.
+A recording of this stack holds everything that the causes need. In `LowState` and `LowCmd` of another
+robot, and in a table, kinematics and policy are missing. The causes that need them are then not
+examined, and the answer lists them.
 A policy of another project (`quadvel policy import`) is not replayed; `--policy none` asks without
 one.
 

@@ -1,6 +1,6 @@
 """Commands that are lost: the drive continues with an earlier one.
 
-`quadvel_sysid.search.lost_commands` infers the times of losses from a log.
+The identification infers the times of losses from a log; here they are given or drawn.
 """
 
 from __future__ import annotations

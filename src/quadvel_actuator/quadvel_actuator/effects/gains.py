@@ -1,6 +1,6 @@
 """Gains that vary with torque sign, time, temperature or voltage; coupling between joints.
 
-`quadvel_sysid.search.effect_candidates.gains` has what the identification needs to find them.
+The identification that finds them in logs is a package of its own.
 """
 
 from __future__ import annotations
