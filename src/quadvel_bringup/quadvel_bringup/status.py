@@ -108,8 +108,13 @@ def _wait_for_reports(session: Session, heard: deque[Any]) -> None:
         return
 
     def complete() -> bool:
-        nodes = nodes_from_diagnostics(heard)
-        return nodes.keys() >= LOOP_NODES and len(nodes) >= session.node.count_publishers("/diagnostics")
+        # Each robot has a publisher of low_state; on a loaded machine it is discovered late.
+        nodes, publishers = nodes_from_diagnostics(heard), session.node.count_publishers
+        return (
+            nodes.keys() >= LOOP_NODES
+            and publishers("low_state") > 0
+            and len(nodes) >= publishers("/diagnostics")
+        )
 
     session.spin(LISTEN_TIME_S)
     session.spin_until(complete, DISCOVERY_TIMEOUT_S)
