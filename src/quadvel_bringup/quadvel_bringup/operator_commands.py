@@ -26,8 +26,8 @@ RECOVERY_HINT = "quadvel mode passive, then quadvel mode stand_up"
 """Advice after a fault."""
 TRANSIENT_MODES = {"stand_up": "stance", "lie_down": "passive"}
 """Modes that end by themselves, and their successors."""
-DISCOVERY_TIME_S = 2.0
-"""Time to discover controller and estimator, which a simulator may lack."""
+DISCOVERY_TIME_S = 5.0
+"""Time to discover controller and estimator, which a simulator may lack; a loaded machine takes seconds."""
 MODE_TIMEOUT_S = 10.0
 """Longest duration of standing up or lying down."""
 
