@@ -148,7 +148,7 @@ def test_the_scripted_trot_alone_stands_and_follows_slow_commands_in_all_directi
         velocity.append(np.concatenate([env.velocity[:, :2], env.angular_velocity[:, 2:]], axis=1))
         assert not env.fallen.any()
     error = np.mean(velocity[50:], axis=0) - COMMANDS
-    assert np.hypot(error[:, 0], error[:, 1]).max() < 0.25
+    assert np.hypot(error[:, 0], error[:, 1]).max() < 0.2
     assert np.abs(error[:, 2]).max() < 0.4
 
 

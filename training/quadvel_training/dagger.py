@@ -38,7 +38,7 @@ from . import privileged, process_group
 from .command_grid import CommandGrid, GridConfig
 from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, CheckpointError, cosine, linear, load, set_rate
-from .networks import Gaussian, Mlp, Recurrent, State, select
+from .networks import Recurrent, State, select
 from .onnx_file import commit, export
 from .ppo import IMITATION_HUBER_DELTA, masked_mean
 from .privileged import ACTION_BOUND, ACTION_SCALE, Past
@@ -119,8 +119,7 @@ class Teacher:
             env: environments.
             past: past of their robots, which the caller advances.
         """
-        self.actor = Gaussian(Mlp(privileged.OBSERVATION_SIZE, 12), 12, 1.0)
-        self.actor.load_state_dict(checkpoint["actor"])
+        self.actor = privileged.load_teacher(checkpoint)
         self.env, self._past = env, past
         n = env.config.n
         self._executed = deque([np.zeros((n, 12), np.float32) for _ in range(HOLD_TICKS)], HOLD_TICKS)

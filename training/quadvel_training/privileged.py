@@ -132,8 +132,8 @@ class Past:
         settled = self.settled[:, None]
         self.lasting += (error - self.lasting) * settled * period / LASTING_S
         self.lag = np.clip(self.lag + error[:, :2] * settled * period, -MAX_LAG_M, MAX_LAG_M)
-        self.lag[env.changed] = 0.0
-        self.lasting[env.changed] = self._age[env.changed] = 0.0
+        for array in (self.lasting, self.lag, self._age):
+            array[env.changed] = 0.0
         self._advance_stances()
         speed = np.hypot(env.velocity[:, 0], env.velocity[:, 1])
         self.clock.advance(command, speed, env.contact & (self.air >= SHORTEST_SWING_S), period)
@@ -237,6 +237,20 @@ def total_action(env: VelocityEnv, past: Past, correction: np.ndarray) -> np.nda
     """
     scripted = joint_offsets(env, past.clock, past.lag) / ACTION_SCALE
     return np.clip(scripted + correction, -ACTION_BOUND, ACTION_BOUND).astype(np.float32)
+
+
+def load_teacher(checkpoint: dict[str, Any]) -> Gaussian:
+    """Load the teacher's network, which corrects the scripted trot.
+
+    Args:
+        checkpoint: content of a checkpoint of this stage.
+
+    Returns:
+        The network; its exploration is that of the checkpoint.
+    """
+    actor = Gaussian(Mlp(OBSERVATION_SIZE, 12), 12, 1.0)
+    actor.load_state_dict(checkpoint["actor"])
+    return actor
 
 
 def critic_extra(env: VelocityEnv, past: Past) -> np.ndarray:

@@ -19,14 +19,13 @@ from quadvel_eval.gait_kind import GaitKind
 
 from .env import EnvConfig, VelocityEnv
 from .loop import load
-from .networks import Gaussian, Mlp
+from .networks import Gaussian
 from .privileged import (
     ACTION_SCALE,
-    OBSERVATION_SIZE,
     NumberedCheckpoints,
     Past,
     PrivilegedConfig,
-    PrivilegedRun,
+    load_teacher,
     observe,
     total_action,
 )
@@ -111,7 +110,7 @@ class Walk:
         start = f"walk at {vx:g}, {vy:g} m/s, {wz:g} rad/s: {self.falls} of {self.robots} fell"
         if self.gait is None:
             return start
-        x, y, turn = self.velocity + 0.0
+        x, y, turn = self.velocity
         return (
             f"{start}, {x:.3f}, {y:.3f} m/s, {turn:.3f} rad/s, error {self.error:.3f} m/s, "
             f"diagonal feet alike {100 * self.gait.diagonal:.0f} %, feet of one side "
@@ -210,23 +209,11 @@ def walk_drawn_robots(checkpoint: Path, config: PrivilegedConfig, robots: int) -
     Raises:
         FileNotFoundError: there is no such file.
     """
-    actor = Gaussian(Mlp(OBSERVATION_SIZE, 12), 12, 1.0)
-    actor.load_state_dict(load(checkpoint)["actor"])
-    return walk(actor, config, TABLE_COMMANDS, robots, config.randomisation)
+    return walk(load_teacher(load(checkpoint)), config, TABLE_COMMANDS, robots, config.randomisation)
 
 
 class WalkLog(NumberedCheckpoints):
     """Keeper of numbered checkpoints that also prints and plots walks of nominal robots."""
-
-    def __init__(self, run: PrivilegedRun, folder: Path) -> None:
-        """Keep the checkpoints of a run.
-
-        Args:
-            run: training run.
-            folder: run directory.
-        """
-        super().__init__(run, folder)
-        self._walker = run
 
     @override
     def keep(self) -> dict[str, float]:
@@ -237,8 +224,7 @@ class WalkLog(NumberedCheckpoints):
         """
         super().keep()
         figures: dict[str, float] = {}
-        run = self._walker
-        for one in walk(run.actor, run.config, LOGGED_COMMANDS, 1, Randomisation.none()):
+        for one in walk(self._run.actor, self._run.config, LOGGED_COMMANDS, 1, Randomisation.none()):
             print(one.line, flush=True)
             if one.gait:
                 known = {"velocity": float(one.velocity[0])} | attrs.asdict(one.gait)

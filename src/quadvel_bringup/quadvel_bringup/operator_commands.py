@@ -15,7 +15,7 @@ from std_srvs.srv import SetBool, Trigger
 from quadvel_msgs.msg import ControllerState
 from quadvel_msgs.srv import Push, ResetSim, SetMode, StepSim
 
-from .session import NotRunningError, Session
+from .session import DISCOVERY_TIMEOUT_S, NotRunningError, Session
 from .stack import LOW_LEVELS
 
 START_HINT = "start the robot first: quadvel up"
@@ -26,8 +26,6 @@ RECOVERY_HINT = "quadvel mode passive, then quadvel mode stand_up"
 """Advice after a fault."""
 TRANSIENT_MODES = {"stand_up": "stance", "lie_down": "passive"}
 """Modes that end by themselves, and their successors."""
-DISCOVERY_TIME_S = 5.0
-"""Time to discover controller and estimator, which a simulator may lack; a loaded machine takes seconds."""
 MODE_TIMEOUT_S = 10.0
 """Longest duration of standing up or lying down."""
 
@@ -95,8 +93,9 @@ def reset(keyframe: str, terrain: str = "", slope: float = 0.0) -> int:
     with Session("reset") as session:
         passive = session.node.create_client(SetMode, "controller/set_mode")
         odometry = session.node.create_client(Trigger, "estimator/reset_odometry")
+        # A simulator may lack controller and estimator.
         session.spin_until(
-            lambda: passive.service_is_ready() and odometry.service_is_ready(), DISCOVERY_TIME_S
+            lambda: passive.service_is_ready() and odometry.service_is_ready(), DISCOVERY_TIMEOUT_S
         )
         if passive.service_is_ready():
             session.call(SetMode, [passive.service_name], lambda: START_HINT, mode="passive")

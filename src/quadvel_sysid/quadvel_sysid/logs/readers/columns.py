@@ -1,6 +1,6 @@
 """Read the fields of a log from a file, whatever its columns are called.
 
-A column counts as a field if it has its name or an alias (`names`), or if a map file says so.
+A column counts as a field if it has its name or an alias (`names`), or if a map file assigns it.
 
 A map file is YAML with one line for each field that has another name:
 
