@@ -15,21 +15,21 @@ quadvel_dds.install()
 import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 
-from quadvel_eval.script import RETRY_INTERVAL_S  # noqa: E402
-from quadvel_lab.scripted_planner import ScriptedPlanner  # noqa: E402
+from quadvel_lab.scripted_planner import RETRY_INTERVAL_S, ScriptedPlanner  # noqa: E402
 from quadvel_msgs.msg import ControllerState  # noqa: E402
 from quadvel_msgs.srv import SetMode  # noqa: E402
 
 
 class Controller:
-    """Fake controller in mode passive, with a given loop rate, that records mode requests."""
+    """Fake controller with a given mode and loop rate that records mode requests."""
 
     def __init__(self) -> None:
         rclpy.init(args=["test"])
         self.node, self._planner = rclpy.create_node("controller"), ScriptedPlanner()
         self._executor = SingleThreadedExecutor()
-        for node in (self.node, self._planner):
-            self._executor.add_node(node)
+        self._executor.add_node(self._planner)
+        self._own_executor = SingleThreadedExecutor()
+        self._own_executor.add_node(self.node)
         self.asked: list[str] = []
         self._state = self.node.create_publisher(ControllerState, "controller/state", 10)
         self.node.create_service(SetMode, "controller/set_mode", self._on_set_mode)
@@ -38,16 +38,21 @@ class Controller:
         self.asked.append(request.mode)
         return response
 
-    def publish_until(self, rate: float, is_so: Callable[[], Any]) -> None:
-        """Publish states (rate: Hz of the loop) until the predicate holds."""
+    def publish_until(
+        self, rate: float, is_so: Callable[[], Any], *, mode: str = "passive", answers: bool = True
+    ) -> None:
+        """Publish states (rate: Hz of the loop) until the predicate holds; answer requests, or let them wait."""
         until = time.monotonic() + 20.0
         while not is_so():
             assert time.monotonic() < until, f"asked for {self.asked}"
-            self._state.publish(ControllerState(mode_name="passive", rate_hz=rate))
+            self._state.publish(ControllerState(mode_name=mode, rate_hz=rate))
             self._executor.spin_once(timeout_sec=0.01)
+            if answers:
+                self._own_executor.spin_once(timeout_sec=0.01)
 
     def close(self) -> None:
         self._executor.shutdown()
+        self._own_executor.shutdown()
         for node in (self.node, self._planner):
             node.destroy_node()
         rclpy.try_shutdown()
@@ -66,3 +71,11 @@ def test_no_mode_is_requested_before_the_controller_receives_states(controller: 
     assert controller.asked == []
     controller.publish_until(200.0, lambda: controller.asked)
     assert controller.asked[0] == "stand_up"
+
+
+def test_a_request_that_waits_for_its_answer_is_not_repeated(controller: Controller) -> None:
+    until = time.monotonic() + 4.0 * RETRY_INTERVAL_S
+    controller.publish_until(200.0, lambda: time.monotonic() > until, answers=False)
+    until = time.monotonic() + 2.0 * RETRY_INTERVAL_S
+    controller.publish_until(200.0, lambda: time.monotonic() > until, mode="stand_up")
+    assert controller.asked == ["stand_up"]

@@ -10,8 +10,6 @@ import attrs
 
 Velocity = tuple[float, float, float]  # vx, vy (m/s), wz (rad/s)
 
-RETRY_INTERVAL_S = 0.5  # between requests of the same mode: the controller may not be ready for the first
-
 
 @attrs.frozen
 class ModeRequest:
@@ -95,7 +93,8 @@ class Action:
 
     Attributes:
         step: Name of the step.
-        requested_mode: Mode to request, or None.
+        requested_mode: Mode to request, or None. It stays until the controller reports the mode; the
+            caller decides how often to repeat a request.
         velocity: Velocity to command: vx, vy (m/s), wz (rad/s), body frame; None: no command.
     """
 
@@ -114,7 +113,6 @@ class ScriptRunner:
     def __init__(self, steps: tuple[Step, ...]) -> None:
         self._steps = list(steps)
         self._step_start: float | None = None  # start of the present step, s
-        self._last_request: float | None = None
 
     def update(self, now: float, mode: str, reason: str = "") -> Action | None:
         """Return the next action.
@@ -138,7 +136,7 @@ class ScriptRunner:
             and self._is_over(self._steps[0], now - self._step_start, mode)
         ):
             self._steps.pop(0)
-            self._step_start = self._last_request = None
+            self._step_start = None
         if not self._steps:
             return None
         if self._step_start is None:
@@ -148,7 +146,7 @@ class ScriptRunner:
             if mode in ("passive", "lie_down"):
                 raise ScriptError(f"the controller is in mode {mode} during '{step.name}': {reason}")
             return Action(step.name, velocity=step.velocity)
-        return Action(step.name, requested_mode=step.mode if self._is_due(step, now, mode) else None)
+        return Action(step.name, requested_mode=None if mode in ("", step.mode) else step.mode)
 
     def _is_over(self, step: Step, elapsed: float, mode: str) -> bool:
         """Return whether a step has ended. Raises ScriptError after the timeout of a request."""
@@ -158,12 +156,3 @@ class ScriptRunner:
             found = mode or "unknown"
             raise ScriptError(f"'{step.name}' took more than {step.timeout:g} s; the mode is {found}")
         return mode == step.awaited_mode
-
-    def _is_due(self, order: ModeRequest, now: float, mode: str) -> bool:
-        """Return whether to send a request now, at most one every RETRY_INTERVAL_S."""
-        if mode in ("", order.mode) or (
-            self._last_request is not None and now - self._last_request < RETRY_INTERVAL_S
-        ):
-            return False
-        self._last_request = now
-        return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import attrs
@@ -16,6 +17,10 @@ from quadvel_msgs.srv import SetMode
 from quadvel_nodes.node import read_parameters, request_exit, run
 
 CMD_VEL_PERIOD_S = 0.02
+RETRY_INTERVAL_S = 0.5  # from the answer to a request to the next request, while the mode does not change
+ANSWER_TIMEOUT_S = (
+    3.0  # after which a request counts as lost; a controller without processor time answers late
+)
 
 
 @attrs.frozen
@@ -37,6 +42,7 @@ class ScriptedPlanner(Node):
         settings = read_parameters(self, PlannerParameters)
         self._runner = ScriptRunner(SCRIPTS[settings.script])
         self._mode = self._reason = self._step = ""
+        self._next_request = 0.0  # earliest time of the next request, s of the monotonic clock
         self._velocity = self.create_publisher(Twist, "cmd_vel", 10)
         self._announcement = self.create_publisher(String, "planner/step", 10)
         self._set_mode = self.create_client(SetMode, "controller/set_mode")
@@ -67,9 +73,19 @@ class ScriptedPlanner(Node):
             self._velocity.publish(_twist(action.velocity))
 
     def _request_mode(self, mode: str) -> None:
-        """Request a mode. The controller's state shows the answer; the script repeats failed requests."""
-        if self._set_mode.service_is_ready():
-            self._set_mode.call_async(SetMode.Request(mode=mode))
+        """Request a mode, unless an earlier request is on its way or its answer is not visible yet.
+
+        The controller's state shows the answer, and the script repeats its request until then. The
+        controller serves each request: one too many arrives in the next mode, and is refused there.
+        """
+        if time.monotonic() < self._next_request or not self._set_mode.service_is_ready():
+            return
+        self._next_request = time.monotonic() + ANSWER_TIMEOUT_S
+        self._set_mode.call_async(SetMode.Request(mode=mode)).add_done_callback(self._on_answer)
+
+    def _on_answer(self, _: Any) -> None:
+        """Allow the next request in a moment: the mode of an accepted one is reported first."""
+        self._next_request = time.monotonic() + RETRY_INTERVAL_S
 
 
 def _twist(velocity: Velocity) -> Any:
