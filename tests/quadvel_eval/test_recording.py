@@ -99,7 +99,7 @@ def joints(time: float) -> Any:
     )
 
 
-def demo(fall_at: float = np.inf) -> Iterator[tuple[str, float, Any]]:
+def demo(fall_at: float = np.inf, rise_at: float = 0.0) -> Iterator[tuple[str, float, Any]]:
     """Five seconds of FIRST, four of standing; the robot lags for a second, then is 0.1 m/s too fast along x."""
     for k in range(9 * 200):
         t, tick = 0.005 * k, 5 * k
@@ -107,7 +107,7 @@ def demo(fall_at: float = np.inf) -> Iterator[tuple[str, float, Any]]:
         settled = (t >= 1.0 and t < 5.0) or t >= 6.0
         velocity = command + FASTER if settled else np.array([9.0, 9.0, 9.0])
         now = T0 + t
-        yield "/ground_truth/odom", now, odometry(now, velocity, 0.42 if t < fall_at else 0.1)
+        yield "/ground_truth/odom", now, odometry(now, velocity, 0.42 if rise_at <= t < fall_at else 0.1)
         yield "/velocity_estimate", now + 0.001, estimate(now, velocity + ESTIMATE_ERROR)
         yield "/low_state", now, low_state(now, tick)
         yield "/low_cmd", now + 0.002, low_cmd(now + 0.0015, tick)
@@ -175,6 +175,16 @@ def test_time_from_state_to_command_is_found_by_the_tick(recorded: Callable[...,
 
 def test_a_fall_is_counted_once(recorded: Callable[..., Path]) -> None:
     assert summarise_demo(read_recording(recorded(fall_at=7.0)))["falls"] == 1
+
+
+def test_a_robot_that_lies_before_the_first_report_of_the_controller_has_not_fallen(tmp_path: Path) -> None:
+    late = T0 + 1.0
+    messages = (
+        (topic, time, message)
+        for topic, time, message in demo(rise_at=0.9)
+        if topic != "/controller/state" or time > late
+    )
+    assert summarise_demo(read_recording(write(tmp_path / "late.mcap", messages)))["falls"] == 0
 
 
 def test_pictures_are_drawn(recorded: Callable[..., Path], tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def test_a_mode_is_requested_until_the_controller_follows() -> None:
 def test_a_standing_robot_gets_no_request_to_stand_up() -> None:
     assert ScriptRunner((STAND_UP, WALK)).update(0.0, "stand_up").requested_mode is None
     runner = ScriptRunner((STAND_UP, WALK))
-    runner.update(0.0, "stance")
+    assert runner.update(0.0, "stance").requested_mode is None
     assert runner.update(0.1, "stance").velocity == WALK.velocity
 
 

@@ -104,11 +104,11 @@ def _mean(values: Array) -> float:
 
 
 def _falls(recording: Recording) -> int:
-    """Count the falls of a recording."""
+    """Count the falls of a recording. Before the controller's first report the robot may lie."""
     loop = recording.loop
-    upright = np.array([mode in UPRIGHT_MODES for mode in loop.mode])
-    now = np.maximum(np.searchsorted(loop.time, recording.position.time, side="right") - 1, 0)
-    return count_falls(recording.position.value[:, 2], recording.quaternion.value, upright[now])
+    upright = np.array([False, *(mode in UPRIGHT_MODES for mode in loop.mode)])
+    reports_so_far = np.searchsorted(loop.time, recording.position.time, side="right")
+    return count_falls(recording.position.value[:, 2], recording.quaternion.value, upright[reports_so_far])
 
 
 def _loop_figures(recording: Recording) -> dict[str, float]:

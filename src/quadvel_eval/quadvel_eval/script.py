@@ -146,7 +146,12 @@ class ScriptRunner:
             if mode in ("passive", "lie_down"):
                 raise ScriptError(f"the controller is in mode {mode} during '{step.name}': {reason}")
             return Action(step.name, velocity=step.velocity)
-        return Action(step.name, requested_mode=None if mode in ("", step.mode) else step.mode)
+        needs_no_request = mode in (
+            "",
+            step.mode,
+            step.awaited_mode,
+        )  # "": before the controller's first report
+        return Action(step.name, requested_mode=None if needs_no_request else step.mode)
 
     def _is_over(self, step: Step, elapsed: float, mode: str) -> bool:
         """Return whether a step has ended. Raises ScriptError after the timeout of a request."""
