@@ -28,12 +28,12 @@ from quadvel_bringup.__main__ import main
 from quadvel_bringup.processes import ProcessGroup
 from quadvel_policy.policy_file import SHIPPED_POLICY
 from tests.helpers.robots import ALIENGO
+from tests.helpers.standing import READY, wait_until_ready
 from tests.quadvel_sysid.joint_logs import fields, mcap
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("*.md", "docs/**/*.md", "src/*/README.md", "training/README.md", "ros_ws/README.md")
 PROGRAMS = {"quadvel": [sys.executable, "-m", "quadvel_bringup"], "python": [sys.executable]}
-READY = "ready; waiting for a velocity command"
 
 
 @attrs.frozen
@@ -311,6 +311,9 @@ def _run_here(words: list[str], folder: Path) -> int:
 
 
 def _wait_for(step: Step, group: ProcessGroup, said: list[str]) -> None:
+    if step.then == READY:
+        wait_until_ready(lambda: "\n".join(said), lambda: not group.ended())
+        return
     until = time.monotonic() + 120.0
     while step.then and not any(step.then in line for line in said):
         assert not group.ended(), f"{step.example}: {said[-5:]}"

@@ -18,6 +18,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.standing import wait_until_ready
+
 QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
 
 
@@ -44,6 +46,9 @@ class Robot:
             assert self._process.poll() is None, self._log.read_text()
             assert time.monotonic() < until, f"{text!r} is not in:\n{self._log.read_text()}"
             time.sleep(0.05)
+
+    def is_running(self) -> bool:
+        return self._process.poll() is None
 
     def log(self) -> str:
         """All that it said since it was told to forget."""
@@ -97,7 +102,7 @@ class Shown:
 def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
     robot = Robot(tmp_path_factory.mktemp("up") / "up.log")
     try:
-        robot.says("ready; waiting for a velocity command")
+        wait_until_ready(robot.log, robot.is_running)
         yield robot
     finally:
         code = robot.end()

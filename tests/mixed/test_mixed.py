@@ -80,8 +80,12 @@ def test_rclpy_sees_embedded_nodes_their_topics_and_the_same_types(graph: Any) -
             if name not in {who.node_name for who in seen[topic]}
         }
 
-    graph.wait(lambda: not unseen(), unseen)
-    assert {*TOPICS.values()} <= {*graph.node.get_node_names()}
+    def are_seen() -> bool:
+        """Whether all nodes, topics and publishers are discovered, one after the other."""
+        nodes = {*graph.node.get_node_names()}
+        return not unseen() and {*TOPICS.values()} <= nodes and all(map(graph.node.count_publishers, own))
+
+    graph.wait(are_seen, unseen)
     for topic in own:
         (writer,) = graph.node.get_publishers_info_by_topic(topic)
         readers = graph.node.get_subscriptions_info_by_topic(topic)

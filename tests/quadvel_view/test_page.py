@@ -23,6 +23,7 @@ import yaml
 from matplotlib.image import imread
 
 from quadvel_bringup.stack import PARAMETERS
+from tests.helpers.standing import wait_until_ready
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -66,6 +67,12 @@ class Served:
             time.sleep(0.05)
         return found[1]
 
+    def log(self) -> str:
+        return self._log.read_text()
+
+    def is_running(self) -> bool:
+        return self._process.poll() is None
+
     def end(self) -> int:
         self._process.send_signal(signal.SIGINT)
         return self._process.wait(30.0)
@@ -91,7 +98,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     parameters["view"]["ros__parameters"]["port"] = 0
     (folder / "params.yaml").write_text(yaml.safe_dump(parameters))
     up = Served(folder / "up.log", "up", "--view", "--params", "params.yaml")
-    up.said("(ready; waiting for a velocity command)")
+    wait_until_ready(up.log, up.is_running)
     yield up.said(r"open (http://127\.0\.0\.1:\d+/)")
     assert up.end() == 0
 
