@@ -74,7 +74,7 @@ LOGS = [  # of one leg each, or of twelve joints
     Step("quadvel identify walk.mcap --out out/identify", more="--joints FR_calf"),
     Step("quadvel identify walk_1.npz --holdout walk_2.npz --gains 35 0.5 --robot go2 --out out/identify"),
     Step("quadvel identify walk_1.npz --joints FR_hip FR_thigh FR_calf --out out/identify"),
-    Step("quadvel identify hung.npz --gains 30 0.5 --out out/identify"),
+    Step("quadvel identify suspended.npz --gains 30 0.5 --out out/identify"),
     Step("quadvel identify out/loop/walk.npz --out out/loop/identified"),
 ]
 NODES = [
@@ -130,8 +130,8 @@ LEFT_OUT = {
     "quadvel pause --off": "the same",
     "quadvel step 20": "the same",
     "quadvel demo --low-level board --loss 0.02 --jitter 2": "minutes; tests/end_to_end/test_walk_behind_network.py",
-    "quadvel excite creep --seconds 60 --low-level external --out hung.mcap": "needs the robot",
-    "quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml": "test_calibration.py has one",
+    "quadvel excite creep --seconds 60 --low-level external --out suspended.mcap": "needs the robot",
+    "quadvel calibrate --suspended suspended.mcap --standing standing.mcap --out calibration.yaml": "test_calibration.py has one",
     "quadvel up --low-level board": "a board waits for nobody; tests/end_to_end/test_board.py, on a machine with time to spare",
     "quadvel record low_state --seconds 5 --out standing.mcap": "as the other recordings",
     "quadvel up --low-level driver": "needs the robot",
@@ -250,8 +250,8 @@ def sandbox(tmp_path: Path) -> Path:
     shutil.copy(SHIPPED_POLICY, tmp_path / "my.onnx")
     mcap(tmp_path / "walk.mcap", fields(seconds=2.0))
     (tmp_path / "out" / "loop").mkdir(parents=True)
-    for seed, name in enumerate(("walk_1", "walk_2", "hung", "out/loop/walk")):
-        np.savez(tmp_path / f"{name}.npz", **leg_log(seed, with_torque=name != "hung"))
+    for seed, name in enumerate(("walk_1", "walk_2", "suspended", "out/loop/walk")):
+        np.savez(tmp_path / f"{name}.npz", **leg_log(seed, with_torque=name != "suspended"))
     return tmp_path
 
 

@@ -84,9 +84,9 @@ def test_what_tells_nothing_is_refused_in_one_sentence_and_writes_nothing(
 ) -> None:
     file = tmp_path / "calibration.yaml"
     for arguments, sentence in (
-        ((), "name one with --hung, with --standing, or both"),
+        ((), "name one with --suspended, with --standing, or both"),
         (("--standing", tmp_path / "none.mcap"), "there is no such file"),
-        (("--hung", standing), "hardly moves to and fro; record quadvel excite creep"),
+        (("--suspended", standing), "hardly moves to and fro; record quadvel excite creep"),
     ):
         code, text = calibrate(*arguments, "--out", file)
         assert code == 2

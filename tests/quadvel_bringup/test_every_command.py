@@ -33,7 +33,7 @@ NAMES_OR_FILES = {("world", "world"), ("twin", "plants")}
 LOG = "log.npz"
 EVALUATION = "eval.json"
 NEEDED = {
-    ("calibrate", "--out"): ["--hung", "hung.mcap"],
+    ("calibrate", "--out"): ["--suspended", "suspended.mcap"],
     "compare": [EVALUATION, EVALUATION],
     "demo": ["--no-video"],
     ("demo", "--world"): ["follow"],
@@ -250,7 +250,7 @@ def suffixes(place: Place) -> tuple[str, ...]:
     if "onnx" in place.option or place.option in ("--policy", "--estimator-file", "--model", "weights"):
         return (".onnx",)
     if place.command in ("identify", "plot", "replay", "calibrate", "view", "why") and place.option in (
-        "logs", "--holdout", "recording", "--hung", "--standing"
+        "logs", "--holdout", "recording", "--suspended", "--standing"
     ):  # fmt: skip
         return (
             (".mcap", ".npz", ".csv", ".json", "") if place.command in ("identify", "why") else (".mcap", "")

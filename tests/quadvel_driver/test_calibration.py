@@ -1,4 +1,4 @@
-"""Sensors that are off: found from a hung and a standing robot, and set right."""
+"""Sensors that are off: found from a suspended and a standing robot, and set right."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ OFF = Calibration(
 )
 
 
-def recorded(hung: bool, seconds: float, off: Calibration) -> list[RobotState]:
+def recorded(suspended: bool, seconds: float, off: Calibration) -> list[RobotState]:
     """What a simulated robot reports whose sensors are off, driven to where they say it should go."""
-    simulator = Simulator(SimulatorConfig(robot=ALIENGO, suspended=hung, seed=3))
+    simulator = Simulator(SimulatorConfig(robot=ALIENGO, suspended=suspended, seed=3))
     simulator.reset("stand")
     targets = (
         Creep(ALIENGO, seconds=seconds).targets()
-        if hung
+        if suspended
         else np.tile(ALIENGO.nominal_q, (round(1e3 * seconds), 1))
     )
     states = []
@@ -46,7 +46,7 @@ def recorded(hung: bool, seconds: float, off: Calibration) -> list[RobotState]:
 
 
 @pytest.fixture(scope="module")
-def hung() -> Samples:
+def suspended() -> Samples:
     return Samples.from_states(recorded(True, 60.0, OFF))
 
 
@@ -70,8 +70,8 @@ def test_the_holding_torque_is_that_of_the_simulator() -> None:
         )
 
 
-def test_zeros_and_mounting_are_found_together(hung: Samples, standing: Samples) -> None:
-    found = fit_calibration(ALIENGO, hung, standing)
+def test_zeros_and_mounting_are_found_together(suspended: Samples, standing: Samples) -> None:
+    found = fit_calibration(ALIENGO, suspended, standing)
     np.testing.assert_allclose(found.calibration.joint_zeros, OFF.joint_zeros, atol=1.5 * DEGREE)
     np.testing.assert_allclose(found.calibration.imu_mounting, OFF.imu_mounting, atol=1.2 * DEGREE)
     assert found.unevenness < 0.005
@@ -145,12 +145,12 @@ def test_a_file_that_is_none_is_refused_by_name(tmp_path: Path, text: str, sente
     assert str(file) in str(refused.value)
 
 
-def test_recordings_that_tell_nothing_are_refused(hung: Samples, standing: Samples) -> None:
+def test_recordings_that_tell_nothing_are_refused(suspended: Samples, standing: Samples) -> None:
     with pytest.raises(
         CalibrationDataError, match="FR_hip_joint hardly moves to and fro; record quadvel excite creep"
     ):
         fit_calibration(ALIENGO, standing, None)
     with pytest.raises(CalibrationDataError, match="rad/s, expected a robot that stands still"):
-        fit_calibration(ALIENGO, None, attrs.evolve(hung, dq=hung.dq + 0.5))
+        fit_calibration(ALIENGO, None, attrs.evolve(suspended, dq=suspended.dq + 0.5))
     with pytest.raises(CalibrationDataError, match="3 states, expected 100 at least"):
         Samples.from_states(recorded(False, 1.02, OFF)[:3])

@@ -140,7 +140,7 @@ def test_the_feet_carry_the_robots_weight_and_a_lifted_foot_nothing() -> None:
 
 def test_in_the_air_nothing_is_carried() -> None:
     begin, _ = simulated(0)
-    assert not MotionPlayer(FootLifting(ALIENGO), hung=True).answer(begin).tau.any()
+    assert not MotionPlayer(FootLifting(ALIENGO), suspended=True).answer(begin).tau.any()
 
 
 def test_the_motions_own_gains_are_sent_unless_others_are_asked_for() -> None:

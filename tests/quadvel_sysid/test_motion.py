@@ -57,7 +57,7 @@ def test_log_without_torque_and_gains_is_refused():
 
 
 def _hung(friction, seconds=5.0, seed=0):
-    """A leg of the robot hung in the air that follows steps of its targets; encoders as good as the real ones."""
+    """A leg of the robot suspended in the air that follows steps of its targets; encoders as good as the real ones."""
     noise = SensorNoise(q=1e-4, dq=0.01)
     simulator = Simulator(
         SimulatorConfig(
@@ -87,7 +87,7 @@ def _hung(friction, seconds=5.0, seed=0):
     held = np.array(targets)
     gains = {"kp": np.full(held.shape, 30.0), "kd": np.full(held.shape, 0.5)}
     return Log(
-        name="hung",
+        name="suspended",
         joints=NAMES[:3],
         t=t,
         q=q,

@@ -33,10 +33,13 @@ MAX_UNEVENNESS_M = 0.01
 
 
 def calibrate_command(
-    hung: Annotated[
+    suspended: Annotated[
         Path | None,
         typer.Option(
-            metavar="<file>", help="Recording of the suspended robot that creeps: for the joint zeros."
+            "--suspended",
+            "--hung",
+            metavar="<file>",
+            help="Recording of the suspended robot that creeps: for the joint zeros.",
         ),
     ] = None,
     standing: Annotated[
@@ -57,18 +60,18 @@ def calibrate_command(
 
     \b
     Suspend the robot, and let nothing else send low_cmd:
-      quadvel excite creep --seconds 60 --low-level external --out hung.mcap
+      quadvel excite creep --seconds 60 --low-level external --out suspended.mcap
     Then let the robot stand on a level floor:
       quadvel record low_state --seconds 5 --out standing.mcap
     Run the driver without a calibration for both. Then:
-      quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml
+      quadvel calibrate --suspended suspended.mcap --standing standing.mcap --out calibration.yaml
       quadvel run driver --ros-args -p calibration:=calibration.yaml
     """
     chosen = load_robot(robot)
-    if hung is None and standing is None:
-        raise ValueError("no recording given: name one with --hung, with --standing, or both")
+    if suspended is None and standing is None:
+        raise ValueError("no recording given: name one with --suspended, with --standing, or both")
     output_file(out)
-    found = fit_calibration(chosen, _samples(hung), _samples(standing))
+    found = fit_calibration(chosen, _samples(suspended), _samples(standing))
     console = Console(soft_wrap=True)
     console.print(_table(found))
     if standing is not None:

@@ -120,7 +120,7 @@ def _add_postures(spec: mujoco.MjSpec, robot: Robot, plant: Plant) -> None:
     if plant.suspended:
         heights = robot.suspended_height, robot.suspended_height
         stand = spec.add_equality(
-            name="hung",
+            name="suspended",
             type=mujoco.mjtEq.mjEQ_WELD,
             objtype=mujoco.mjtObj.mjOBJ_BODY,
             name1="trunk",

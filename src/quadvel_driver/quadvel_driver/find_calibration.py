@@ -304,7 +304,7 @@ def _check_suspended(suspended: Samples) -> None:
         moving = suspended.dq[:, i]
         if min((moving > MIN_MOVING_SPEED).sum(), (moving < -MIN_MOVING_SPEED).sum()) < MIN_ROWS // 2:
             raise CalibrationDataError(
-                f"{name} hardly moves to and fro; record quadvel excite creep with the robot hung"
+                f"{name} hardly moves to and fro; record quadvel excite creep with the robot suspended"
             )
 
 

@@ -72,7 +72,7 @@ class MotionPlayer:
         excitation: The motion.
         kp: Position gain, N m/rad; None for that of the motion.
         kd: Velocity gain, N m s/rad; None for that of the motion.
-        hung: Whether the feet are in the air; None for the choice of the motion.
+        suspended: Whether the feet are in the air; None for the choice of the motion.
 
     Attributes:
         total: Duration of ramp and motion, s.
@@ -84,14 +84,14 @@ class MotionPlayer:
         excitation: Excitation,
         kp: float | None = None,
         kd: float | None = None,
-        hung: bool | None = None,
+        suspended: bool | None = None,
     ) -> None:
 
         self._robot = excitation.robot
         self._targets = excitation.targets()
         self._kp = excitation.kp if kp is None else kp
         self._kd = excitation.kd if kd is None else kd
-        in_the_air = excitation.hung if hung is None else hung
+        in_the_air = excitation.suspended if suspended is None else suspended
         self._support = np.zeros_like(self._targets) if in_the_air else excitation.support_torque()
         self._begin: RobotState | None = None
         self._last = 0.0
@@ -173,10 +173,13 @@ def excite_command(
     robot: Annotated[
         str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or the folder of a robot.")
     ] = DEFAULT_ROBOT,
-    hung: Annotated[
+    suspended: Annotated[
         bool | None,
         typer.Option(
-            "--hung/--ground", help="Feet in the air, or on the ground.", show_default="by the motion"
+            "--suspended/--ground",
+            "--hung",
+            help="Feet in the air, or on the ground.",
+            show_default="by the motion",
         ),
     ] = None,
     kp: Annotated[
@@ -232,7 +235,7 @@ def excite_command(
     if path.exists():
         raise FileExistsError(f"{path} exists already; name another file with --out")
     output_file(path)
-    in_the_air = excitation.hung if hung is None else hung
+    in_the_air = excitation.suspended if suspended is None else suspended
     parameters: dict[str, Any] = {"robot": absolute_file(robot), "hung": in_the_air, "seed": seed}
     if actuator is not None:
         parameters["actuator_file"] = str(actuator.resolve())

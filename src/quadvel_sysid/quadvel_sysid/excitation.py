@@ -40,12 +40,12 @@ class Excitation(ABC):
     """A motion of all joints for a given duration.
 
     Attributes:
-        hung: Whether the robot has to be suspended, with its feet in the air.
+        suspended: Whether the robot has to be suspended, with its feet in the air.
         robot: The robot.
         seconds: Duration, s.
     """
 
-    hung: ClassVar[bool] = True
+    suspended: ClassVar[bool] = True
     robot: Robot
     seconds: float
 
@@ -114,7 +114,7 @@ class OnGround(Excitation):
     the robot stands up. Feed-forward torque carries the weight, so that the feet follow Eq. 9.
     """
 
-    hung: ClassVar[bool] = False
+    suspended: ClassVar[bool] = False
     kp: ClassVar[float] = 150.0
     kd: ClassVar[float] = 4.0
 

@@ -296,7 +296,7 @@ def imply_torque(log: Log, body: Body | None = None) -> tuple[Log, Body]:
             if inertia <= 0.0:
                 raise LogError(
                     f"{log.name}: q/{joint}: the motion implies an inertia of {inertia:.3g} kg m^2; expected a joint "
-                    "that turns freely (the robot hung in the air), or a measured tau"
+                    "that turns freely (the robot suspended in the air), or a measured tau"
                 )
     tau = body.torques(*(np.asarray(x, dtype=np.float64) for x in (coarse.q, coarse.dq, ddq)))
     return attrs.evolve(coarse, tau=tau), body

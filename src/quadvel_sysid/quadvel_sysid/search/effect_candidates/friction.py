@@ -72,7 +72,7 @@ class LoadDependentCandidate(_SignFrictionCandidate):
     """Friction proportional to the load."""
 
     linear = ("mu",)
-    motion = "slow reversals under different loads: hung in the air, standing, with a payload"
+    motion = "slow reversals under different loads: suspended in the air, standing, with a payload"
     depends_on_commands = True
 
 
