@@ -57,8 +57,9 @@ def answer(case: Case, folder: Path, policy: PolicyFile) -> dict[str, Any]:
 
 
 def is_right(result: dict[str, Any]) -> bool:
-    """Whether the answer is the injected defect."""
-    return result["found"] == result["kind"] or result["found"] in ALSO_RIGHT.get(result["kind"], ())
+    """Whether the answer is the injected defect, or names it as what looks the same."""
+    names = {result["found"], *result["alternatives"]}
+    return result["kind"] in names or result["found"] in ALSO_RIGHT.get(result["kind"], ())
 
 
 def has_effect(case: Case, folder: Path) -> bool:

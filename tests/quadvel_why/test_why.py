@@ -15,6 +15,7 @@ from quadvel_policy.imported.importer import Supplement
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import Diagnosis, diagnose
 from quadvel_why.links import CAUSES
+from quadvel_why.links.drives import SpeedTorqueLimit, TorqueLimit
 from quadvel_why.page import page
 from quadvel_why.reading import read_run
 from quadvel_why.run import Commands, Run
@@ -67,6 +68,26 @@ def repeated(run: Run) -> Run:
     return attrs.evolve(run, q=run.q[rows], dq=run.dq[rows])
 
 
+def limited(run: Run, stall: float, no_load: float) -> np.ndarray:
+    """Torques of drives whose limit falls with the speed while they drive, and is constant while they brake."""
+    assert run.tau is not None
+    limit = stall * np.clip(1.0 - run.dq * np.sign(run.tau) / no_load, 0.0, 1.0)
+    return np.clip(run.tau, -limit, limit)
+
+
+def first(run: Run, rows: int) -> Run:
+    """The beginning of a run."""
+    assert run.tau is not None
+    assert run.imu is not None
+    answers = run.commands.answers < rows
+
+    def cut(record: attrs.AttrsInstance, kept: slice | np.ndarray) -> dict[str, np.ndarray]:
+        return {f.name: getattr(record, f.name)[kept] for f in attrs.fields(type(record))}
+
+    shorter = imu(commands(run, **cut(run.commands, answers)), **cut(run.imu, slice(rows)))
+    return attrs.evolve(shorter, **{f: getattr(run, f)[:rows] for f in ("time", "q", "dq", "tau")})
+
+
 CHANGES: dict[str, Callable[[Run], Run]] = {
     "joint_order": lambda r: attrs.evolve(r, **{f: getattr(r, f)[:, ORDER] for f in ("q", "dq", "tau")}),
     "joint_sign": lambda r: attrs.evolve(r, q=flipped(r.q, 4), dq=flipped(r.dq, 4), tau=flipped(r.tau, 4)),
@@ -103,6 +124,27 @@ def test_a_changed_recording_is_named_by_what_was_changed(name: str, run: Run) -
     assert found.cause.name() == name, found.measurement.sentence
     assert found.measurement.value > found.limit
     assert found.measurement.traces
+
+
+def test_a_robot_that_stood_for_a_moment_has_no_weak_drive(run: Run) -> None:
+    standing = first(run, 100)
+    rng = np.random.default_rng(3)
+    noisy = attrs.evolve(standing, tau=standing.tau + rng.normal(0.0, 0.3, standing.q.shape))
+    found = examine(noisy).finding
+    assert found is None, found.cause.name()
+
+
+@pytest.mark.parametrize("no_load", [20.0, 1e9])
+def test_a_limit_that_falls_with_the_speed_is_told_from_a_constant_one(no_load: float, run: Run) -> None:
+    limited_drives = attrs.evolve(run, tau=limited(run, stall=12.0, no_load=no_load))
+    signals = Signals(limited_drives, PolicyFile(ALIENGO))
+    constant, falling = TorqueLimit().measure(signals), SpeedTorqueLimit().measure(signals)
+    assert constant is not None
+    assert falling is not None
+    assert (constant.value > TorqueLimit.least, falling.value > SpeedTorqueLimit.least) == (
+        no_load > 1e6,
+        no_load < 1e6,
+    )
 
 
 def test_another_scale_of_the_actions_is_named(run: Run) -> None:

@@ -22,12 +22,14 @@ from .run import Run
 
 VELOCITY_SCALE_M_S, HEIGHT_SCALE_M = 0.05, 0.003
 """Contradictions that weigh alike; twice what a healthy walk shows."""
-CLEAR_VELOCITY_M_S, CLEAR_HEIGHT_M = 0.15, 0.04
+CLEAR_VELOCITY_M_S, CLEAR_HEIGHT_M = 0.3, 0.04
 """From which on the usual conventions are doubted: a wrong zero moves a foot by less."""
 EXCHANGE, EXCHANGED_SIDES = "left and right legs exchanged", -0.3
 """Correlation of roll moment and roll below which the sides are exchanged; healthy walks show 0.3 to 0.7."""
 MIN_IMPROVEMENT = 0.4
 """Share of the contradiction that an accepted convention may leave."""
+SLOPE_SHARE = 0.1
+"""Share of the unevenness that a slope leaves if it explains it."""
 MIN_PAIR_ROWS = 40
 """Fewest rows with two planted feet that give a contradiction."""
 OFFSET_ROUNDS = 8
@@ -113,9 +115,15 @@ def best_convention(run: Run) -> tuple[Tried | None, Tried]:
         return _tried(run, EXCHANGE), usual
     if not (usual.legs.disagreement > CLEAR_VELOCITY_M_S or usual.legs.unevenness > CLEAR_HEIGHT_M):
         return None, usual
+    if (
+        usual.legs.unevenness > CLEAR_HEIGHT_M
+        and usual.legs.plane.spread < SLOPE_SHARE * usual.legs.unevenness
+    ):
+        return None, usual  # the feet lie on one slope
     best = min((_tried(run, name) for name in CONVENTIONS), key=lambda each: each.contradiction)
-    if best.contradiction > MIN_IMPROVEMENT * usual.contradiction:
-        return None, usual
+    contradicts_more = best.legs.disagreement > max(usual.legs.disagreement, VELOCITY_SCALE_M_S)
+    if best.contradiction > MIN_IMPROVEMENT * usual.contradiction or contradicts_more:
+        return None, usual  # heights alone contradict each other on a slope, too
     return best, usual
 
 

@@ -24,10 +24,14 @@ from .run import Run
 
 PLANTED_N = 40.0
 """Force on the ground, N, above which a foot counts as planted."""
+RESTING_M_S = 0.3
+"""Largest difference of the trunk's velocity from two feet that rest on the ground, m/s."""
 MIN_PUSH_N = 10.0
 BALANCE_WINDOW_S, MIN_BALANCE_ROWS = 0.05, 60
 DAMPING_M2 = 1e-4
 """Damping (m^2) of the least squares for the foot forces; it bounds them near a straight leg."""
+WALKED_SLOPE_RAD = 0.29
+"""Steepest ground on which the shipped policy was shown to walk, 15 degrees, and a margin for its measurement."""
 PAIRS = tuple(combinations(range(4), 2))
 
 
@@ -46,6 +50,16 @@ class GroundPlane:
     heights: Array
     on_slope: Array
     time: Array
+
+    @property
+    def spread(self) -> float:
+        """Robust standard deviation of the heights about the slope, m."""
+        return float(1.4826 * np.median(np.abs(self.heights - self.on_slope)))
+
+    @property
+    def angle(self) -> float:
+        """Inclination of the slope, rad."""
+        return float(np.arctan(np.linalg.norm(self.slope)))
 
 
 class Legs:
@@ -141,10 +155,16 @@ class Legs:
 
     @cached_property
     def plane(self) -> GroundPlane:
-        """Slope of the ground under the planted feet, by least squares."""
+        """Slope of the ground under the feet that rest on it, by least squares.
+
+        At high speed the torque that swings a leg looks like a force on its foot: both feet of a
+        pair also have to show the same velocity of the trunk.
+        """
         world = self._to_world(self.feet)
         heights, apart, times = [], [], []
-        for i, k, rows in self.pair_rows():
+        for i, k, both in self.pair_rows():
+            sliding = np.linalg.norm(self.velocity[:, i] - self.velocity[:, k], axis=-1)
+            rows = both & (sliding < RESTING_M_S)
             heights.append((self.height[:, i] - self.height[:, k])[rows])
             apart.append((world[:, i, :2] - world[:, k, :2])[rows])
             times.append(self.run.time[rows])

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from typing_extensions import override
 
 from quadvel_description.arrays import Array
@@ -25,6 +25,8 @@ BETTER_PAIRING, MIN_ERROR_N2M2 = 4.0, 4.0
 MAX_SPREAD_AT_REST_RAD = 0.02
 EXPLAINED_SHARE = 0.3
 """Share of the mean square torque that a sign may leave."""
+CERTAIN = 3.0
+"""Standard errors by which a coefficient may differ from its estimate."""
 MIN_SHARE_USED = 0.85
 """Share of the states that a fit has to explain before its coefficients count."""
 HOT_DEG_C = 80.0
@@ -191,6 +193,9 @@ def _convention(signals: Signals, kind: str) -> Measurement | None:
     best, usual = best_convention(signals.run)
     if best is None or CONVENTIONS[best.name].kind != kind:
         return NOTHING
+    offset = best_offset(signals.legs)
+    if offset is not None and offset.size > 0.0 and offset.after < best.legs.unevenness:
+        return NOTHING  # a wrong zero explains the heights better
     height = signals.legs.height
     traces = (
         Trace("height of FR minus RR foot below the trunk, m", signals.run.time, height[:, 0] - height[:, 2],
@@ -222,16 +227,16 @@ class JointOrder(Cause):
         if "drives" not in signals.parts:
             return None
         run, exact = signals.run, signals.torque.exact
-        own, source = np.diagonal(exact.pairs), exact.pairs.argmin(axis=1)
-        best = exact.pairs.min(axis=1)
+        # A reordering takes every command once: the order with the least error of all joints together.
+        own, source = np.diagonal(exact.pairs), linear_sum_assignment(exact.pairs)[1]
+        best = exact.pairs[np.arange(len(source)), source]
         gain = own - best
         moved = np.flatnonzero(
             (source != np.arange(len(source)))
             & (own > BETTER_PAIRING * best)
             & (gain > max(MIN_ERROR_N2M2, UNEXPLAINED_SHARE * float(exact.variance.mean())))
         )
-        # A reordering takes every command once.
-        if len(moved) >= 2 and max(Counter(source[moved].tolist()).values()) == 1:
+        if len(moved) >= 2:
             j = int(moved[np.argmax(gain[moved])])
             i = int(source[j])
             listed = ", ".join(f"{run.joints[a]} follows {run.joints[source[a]]}" for a in moved[:4])
@@ -239,7 +244,10 @@ class JointOrder(Cause):
             rows = np.maximum(run.command_rows(exact.delay), 0)
             other = run.commands.kp[rows, i] * (run.commands.q[rows, i] - run.q[:, j])
             other -= run.commands.kd[rows, i] * run.dq[:, j]
-            sentence = f"{listed}{more}: the error of the torque falls {own[j] / best[j]:.0f} times"
+            sentence = (
+                f"{listed}{more}: the torque of {run.joints[j]} is {math.sqrt(best[j]):.1f} N m off that command, "
+                f"{math.sqrt(own[j]):.1f} N m off its own"
+            )
             trace = joint_trace(signals, j, other)
             off = np.where(
                 run.commands.servo[rows], np.abs(signals.torque.asked_at(exact.delay)[:, j] - other), 0.0
@@ -331,15 +339,15 @@ class Gains(Cause):
         fits = signals.torque.fits
         kp = np.array([fit.command for fit in fits]) / trained[0]
         kd = np.array([fit.speed for fit in fits]) / trained[1]
-        kd_doubt = np.array([fit.errors[2] for fit in fits])
+        kp_error, kd_error = (float(np.median([fit.errors[k] for fit in fits])) for k in (0, 2))
         found = []
-        for name, ratio, tolerance in (("kp", kp, 0.0), ("kd", kd, 0.45)):
+        for name, ratio, tolerance in (("kp", kp, CERTAIN * kp_error), ("kd", kd, 0.45)):
             middle = float(np.median(ratio))
             agree = int(
                 (np.sign(np.log(np.maximum(ratio, 1e-3))) == np.sign(math.log(max(middle, 1e-3)))).sum()
             )
             if middle > 0.05 and agree >= MIN_AGREEING_JOINTS * len(fits) // 12:
-                if name == "kd" and np.median(kd_doubt) > 0.1:
+                if name == "kd" and kd_error > 0.1:
                     continue
                 found.append((max(abs(math.log(middle)) - tolerance, 0.0), name, middle))
         if not found:

@@ -10,23 +10,30 @@ from quadvel_description.arrays import Array, Bools
 from quadvel_description.quadruped import KINDS
 
 from ..cause import NOTHING, Cause, Link, Measurement, Trace, worst_span
+from ..legs import WALKED_SLOPE_RAD
+from ..run import Run
 from ..signals import Signals
 from ..torque import robust_std
-from .contract import CLEAR_COEFFICIENT, HOT_DEG_C, MIN_SHARE_USED, joint_trace, torque_span
+from .contract import CERTAIN, CLEAR_COEFFICIENT, HOT_DEG_C, MIN_SHARE_USED, joint_trace, torque_span
 
+CERTAIN_GAIN = 0.1
+"""Standard error below which a joint shows the gain of the drives."""
 SHORT_OF = 6.0
 """A torque is too small if it lacks more than this many standard deviations."""
 MIN_ASKED_NM = 4.0
 PROPORTIONAL, CLEARLY_LESS = 1.5, 0.1
 """Spread around a constant share of the asked torque, by that of the fit, and how much less it has to be."""
 MIN_SHORT_ROWS = 8
-FLAT_SHARE, FALLS = 0.05, -0.4
-"""Spread of a plateau by its height, and correlation of torque and speed of a limit that falls."""
+FALLING_SHARE, MAX_T = 0.03, -5.0
+"""Fall of a limit with the speed, by its torque, and t of their correlation; a constant limit has 0.001 and -1."""
 REST_WINDOW_S = 0.5
 REST_RAD_S, MOVING_RAD_S = 0.25, 0.6
 """Speed of a joint at rest, and median speed of all joints of a robot that moves."""
-HEALTHY_REST_SHARES = (0.68, 0.32, 0.19)
-"""Largest surplus of the time at rest of a hip, thigh and calf in healthy walks."""
+HEALTHY_REST_SHARES, HEALTHY_RANGE_SHARES = (0.54, 0.32, 0.26), (0.13, 0.43, 0.37)
+"""Largest surplus of the time at rest, and smallest share of the range of motion, of a hip, thigh and calf in healthy
+walks, relative to the median joint of the kind."""
+WINDOWS_OVERLAP = 10
+"""Windows that begin within the length of one."""
 
 
 class Temperature(Cause):
@@ -58,19 +65,18 @@ class WeakDrive(Cause):
     link = Link.DRIVES
     unit = "share"
     least = 0.15
-    needs = ("torque",)
+    needs = ("drives",)
     remedy = "Exchange the drive with another one of its kind: if the weakness moves along, it is the drive"
 
     @override
     def measure(self, signals: Signals) -> Measurement | None:
-        run, fits = signals.run, signals.torque.fits
-        given = np.array([fit.command for fit in fits])
+        run = signals.run
+        given, error, used = _given_shares(signals)
         middle = float(np.median(given))
         if middle < CLEAR_COEFFICIENT:
             return None
-        lacks = np.array(
-            [1.0 - fit.command / middle if fit.share_used > MIN_SHARE_USED else 0.0 for fit in fits]
-        )
+        # A joint that hardly moves does not determine its share: only what is certain counts.
+        lacks = np.where(used > MIN_SHARE_USED, 1.0 - (given + CERTAIN * error) / middle, 0.0)
         j = int(np.argmax(lacks))
         sentence = f"{run.joints[j]} gives {100 * given[j]:.0f} % of the asked torque, the others {100 * middle:.0f} %"
         gain = "its gains may be set lower instead: read them from the drive"
@@ -79,8 +85,29 @@ class WeakDrive(Cause):
         )
 
 
+def _given_shares(signals: Signals) -> tuple[Array, Array, Array]:
+    """Share of the asked torque that each joint gives, its standard error, and the share of rows that fit, (J,) each."""
+    if "torque" in signals.parts:
+        fits = signals.torque.fits
+        return tuple(
+            np.array(x) for x in zip(*((f.command, f.errors[0], f.share_used) for f in fits), strict=True)
+        )  # type: ignore[return-value]
+    # A robot that stopped at once: tau = share asked, with the commanded gains.
+    run, exact = signals.run, signals.torque.exact
+    assert run.tau is not None
+    rows = run.command_rows(exact.delay)
+    keep = (rows >= 0) & run.commands.servo[np.maximum(rows, 0)]
+    x, y = signals.torque.asked_at(exact.delay)[keep], run.tau[keep]
+    energy = np.maximum((x**2).sum(axis=0), 1e-9)
+    share = (x * y).sum(axis=0) / energy
+    error = np.sqrt(np.mean((y - share * x) ** 2, axis=0) / energy)
+    return share, error, np.ones(len(share))
+
+
 class JammedJoint(Cause):
-    """A joint stands still much longer than the others of its kind, while these move: it is jammed or sluggish."""
+    """A joint stands still much longer than the others of its kind, or moves much less, while these move: it is jammed
+    or sluggish.
+    """
 
     link = Link.DRIVES
     unit = "times the largest of healthy walks"
@@ -91,32 +118,55 @@ class JammedJoint(Cause):
     @override
     def measure(self, signals: Signals) -> Measurement | None:
         run = signals.run
+        if {"torque", "imu"} <= signals.parts and signals.legs.plane.angle > WALKED_SLOPE_RAD:
+            return NOTHING  # on such ground sound joints rest for longer, too
         width = min(round(REST_WINDOW_S / run.period), len(run.time) - 1)
-        others = np.convolve(
-            np.median(np.abs(run.dq), axis=1),
-            np.full(2 * (width // 5) + 1, 1.0 / (2 * (width // 5) + 1)),
-            "same",
-        )
+        smooth = 2 * (width // 5) + 1
+        others = np.convolve(np.median(np.abs(run.dq), axis=1), np.full(smooth, 1.0 / smooth), "same")
         moving = run.walking & (others > MOVING_RAD_S)
-        rest = (np.abs(run.dq) < REST_RAD_S) & moving[:, None]
-        total, rests = _moving_sum(moving[:, None], width), _moving_sum(rest, width)
-        full = total[:, 0] >= 0.5 * width
-        if not full.any():
+        total = _moving_sum(moving[:, None], width)
+        if not (total >= 0.5 * width).any():
             return None
-        # Share of the time at rest, less that of the median joint of its kind, by what healthy walks show of it.
-        share = (rests / np.maximum(total, 1.0)).reshape(-1, 4, len(KINDS))
-        more = (share - np.median(share, axis=1, keepdims=True)) / np.array(HEALTHY_REST_SHARES)
-        more = np.where(full[:, None], more.reshape(-1, 12), 0.0)
-        row, j = np.unravel_index(int(np.argmax(more)), more.shape)
-        other = (int(j) + 3) % 12
-        span = float(run.time[row]), float(run.time[int(row) + width])
-        title = f"speed of {run.joints[j]} and of {run.joints[other]}, rad/s"
-        trace = Trace(title, run.time, run.dq[:, j], run.dq[:, other])
-        sentence = (
-            f"{run.joints[j]} stands still for {100 * share.reshape(-1, 12)[row, j]:.0f} % of {span[1] - span[0]:.1f} s"
-            " while the others move"
+        row, joint, value, what = max(
+            _longest_rest(run, moving, total, width),
+            _smallest_range(run, total, width),
+            key=lambda one: one[2],
         )
-        return Measurement(float(more[row, j]), sentence, span, (trace,))
+        other = (joint + len(KINDS)) % len(run.joints)
+        span = float(run.time[row]), float(run.time[row + width])
+        title = f"speed of {run.joints[joint]} and of {run.joints[other]}, rad/s"
+        trace = Trace(title, run.time, run.dq[:, joint], run.dq[:, other])
+        sentence = f"{run.joints[joint]} {what} of {span[1] - span[0]:.1f} s in which the others move"
+        return Measurement(value, sentence, span, (trace,))
+
+
+def _longest_rest(run: Run, moving: Bools, total: Array, width: int) -> tuple[int, int, float, str]:
+    """First row, joint, surplus of the time at rest by that of healthy walks, and a text, of the worst window."""
+    rest = (np.abs(run.dq) < REST_RAD_S) & moving[:, None]
+    share = (_moving_sum(rest, width) / np.maximum(total, 1.0)).reshape(-1, 4, len(KINDS))
+    more = (share - np.median(share, axis=1, keepdims=True)) / np.array(HEALTHY_REST_SHARES)
+    more = np.where(total >= 0.5 * width, more.reshape(-1, 12), 0.0)
+    row, joint = np.unravel_index(int(np.argmax(more)), more.shape)
+    at_rest = 100 * share.reshape(-1, 12)[row, joint]
+    return int(row), int(joint), float(more[row, joint]), f"stands still for {at_rest:.0f} %"
+
+
+def _smallest_range(run: Run, total: Array, width: int) -> tuple[int, int, float, str]:
+    """The same for the range of motion: that of the median joint of the kind by the joint's own."""
+    rows = np.flatnonzero(total[:, 0] >= 0.5 * width)[:: max(width // WINDOWS_OVERLAP, 1)]
+    if not len(rows):
+        return 0, 0, 0.0, ""
+    ranges = np.array([np.ptp(run.q[row : row + width], axis=0) for row in rows]).reshape(-1, 4, len(KINDS))
+    share = ranges / np.maximum(np.median(ranges, axis=1, keepdims=True), 1e-6)
+    less = (np.array(HEALTHY_RANGE_SHARES) / np.maximum(share, 1e-3)).reshape(-1, 12)
+    k, joint = np.unravel_index(int(np.argmax(less)), less.shape)
+    moves = 100 * share.reshape(-1, 12)[k, joint]
+    return (
+        int(rows[k]),
+        int(joint),
+        float(less[k, joint]),
+        f"moves by {moves:.0f} % of the range of its kind in the course",
+    )
 
 
 def _moving_sum(values: Array | Bools, width: int) -> Array:
@@ -134,6 +184,7 @@ class _Shortfall:
         share: Share of the usable rows.
         level: Median torque of these rows, N m.
         falls_with_speed: Whether the torque of these rows falls with the joint's speed.
+        is_at_rest: Whether the joint hardly turns in these rows, so that a fall would not show.
     """
 
     joint: int
@@ -141,6 +192,13 @@ class _Shortfall:
     share: float
     level: float
     falls_with_speed: bool
+    is_at_rest: bool
+
+    @property
+    def alternatives(self) -> tuple[tuple[str, str], ...]:
+        """What looks the same as a constant limit in these rows, and how to tell them apart."""
+        experiment = "let the joint turn fast under load: only the limit of a speed-torque curve falls then"
+        return (("speed_torque_limit", experiment),) if self.is_at_rest else ()
 
 
 def _shortfall(signals: Signals) -> _Shortfall | None:
@@ -148,13 +206,20 @@ def _shortfall(signals: Signals) -> _Shortfall | None:
     run, model = signals.run, signals.torque
     assert run.tau is not None
     found = []
-    gain = float(np.median([fit.command for fit in model.fits]))
+    certain = [fit.command for fit in model.fits if fit.errors[0] < CERTAIN_GAIN]
+    gain = float(np.median(certain)) if certain else signals.trained.gains[0]
     for j, fit in enumerate(model.fits):
         asked, given = gain * model.asked[:, j], run.tau[:, j]
         # A drive that gives a constant share of what is asked for is weak, not limited.
         x, y = asked[model.rows], given[model.rows]
         share = float(x @ y) / max(float(x @ x), 1e-9)
-        if robust_std(y - share * x) < PROPORTIONAL * fit.spread and share < 1.0 - CLEARLY_LESS:
+        magnitude = np.abs(y)
+        level = float(np.median(magnitude))
+        is_constant = (
+            robust_std(magnitude - level) < robust_std(y - share * x) and level > SHORT_OF * fit.spread
+        )
+        is_proportional = robust_std(y - share * x) < PROPORTIONAL * fit.spread and not is_constant
+        if is_proportional and share < 1.0 - CLEARLY_LESS:
             continue
         lacks = np.abs(asked) - given * np.sign(asked)
         rows = model.rows & (lacks > SHORT_OF * fit.spread) & (np.abs(asked) > MIN_ASKED_NM)
@@ -164,12 +229,35 @@ def _shortfall(signals: Signals) -> _Shortfall | None:
     count, j, rows = max(found, key=lambda entry: entry[0], default=(0, 0, model.rows))
     if count < MIN_SHORT_ROWS:
         return None
-    given, speed = np.abs(run.tau[rows, j]), np.abs(run.dq[rows, j])
-    level = float(np.median(given))
-    # Of a constant limit the torques do not vary, but for noise.
-    varies = float(np.std(given)) > FLAT_SHARE * level
-    falls = varies and float(np.corrcoef(given, speed)[0, 1]) < FALLS
-    return _Shortfall(j, rows, float(rows.sum() / model.rows.sum()), level, falls)
+    given, speed = np.abs(run.tau[rows, j]), _motoring_speed(run.tau[rows, j], run.dq[rows, j])
+    return _Shortfall(
+        j,
+        rows,
+        float(rows.sum() / model.rows.sum()),
+        float(np.median(given)),
+        _falls(given, speed),
+        bool(np.percentile(speed, 95.0) < REST_RAD_S),
+    )
+
+
+def _falls(torque: Array, speed: Array) -> bool:
+    """Whether torques at a limit fall with the speed, clearly and by more than their noise.
+
+    The fall is that of a line between the 5 % slowest and fastest. For a correlation r of n pairs,
+    t = r sqrt((n - 2) / (1 - r^2)) is Student's if they are independent.
+    """
+    slow, fast = np.percentile(speed, (5.0, 95.0))
+    if np.ptp(torque) == 0.0 or slow == fast:
+        return False
+    fall = -np.polyfit(speed, torque, 1)[0] * (fast - slow)
+    r = float(np.corrcoef(torque, speed)[0, 1])
+    t = r * np.sqrt((len(torque) - 2) / max(1.0 - r**2, 1e-9))
+    return bool(fall > FALLING_SHARE * np.median(torque) and t < MAX_T)
+
+
+def _motoring_speed(torque: Array, speed: Array) -> Array:
+    """Speed in the direction of the torque, rad/s; 0 while the motor brakes."""
+    return np.maximum(speed * np.sign(torque), 0.0)
 
 
 class TorqueLimit(Cause):
@@ -193,7 +281,8 @@ class TorqueLimit(Cause):
             f"{100 * short.share:.1f} % of the states"
         )
         trace = joint_trace(signals, j, signals.torque.asked[:, j])
-        return Measurement(short.share, sentence, worst_span(run.time, short.rows.astype(float)), (trace,))
+        span = worst_span(run.time, short.rows.astype(float))
+        return Measurement(short.share, sentence, span, (trace,), short.alternatives)
 
 
 class SpeedTorqueLimit(Cause):
@@ -212,7 +301,8 @@ class SpeedTorqueLimit(Cause):
             return NOTHING
         run, j = signals.run, short.joint
         assert run.tau is not None
-        slope, stall = np.polyfit(np.abs(run.dq[short.rows, j]), np.abs(run.tau[short.rows, j]), 1)
+        given = run.tau[short.rows, j]
+        slope, stall = np.polyfit(_motoring_speed(given, run.dq[short.rows, j]), np.abs(given), 1)
         sentence = (
             f"{run.joints[j]}: the torque falls from {stall:.0f} N m at rest by {-slope:.1f} N m for each rad/s, in "
             f"{100 * short.share:.1f} % of the states"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from typing_extensions import override
 
@@ -9,16 +11,16 @@ from quadvel_description.arrays import Array
 from quadvel_description.quadruped import GRAVITY
 
 from ..cause import Cause, Link, Measurement, Trace, worst_span
-from ..legs import Legs
+from ..legs import WALKED_SLOPE_RAD, Legs
 from ..signals import Signals
 
 LOADED_N = 60.0
 """A foot that pushes with more cannot be in the act of landing or leaving."""
 MIN_ROWS = 60
+WINDOW_S = 1.0
+"""Time after which a robot that walks from level onto rough ground shows it."""
 MIN_WEIGHING_S = 1.0
 """Shorter means of the force are not the weight."""
-WALKED_SLOPE_RAD = 0.29
-"""Steepest ground on which the shipped policy was shown to walk, 15 degrees, and a margin for its measurement."""
 FOUND_MASS_SHARE = 0.946
 """Share of the mass that massless legs show in the torques, on the mean of healthy walks."""
 MASS_MARGIN_KG = 0.8
@@ -71,7 +73,7 @@ class SteepGround(Cause):
         plane = signals.legs.plane
         if len(plane.time) < MIN_ROWS:
             return None
-        angle = float(np.arctan(np.linalg.norm(plane.slope)))
+        angle = plane.angle
         trace = Trace(
             "height between planted feet and on that slope, m", plane.time, plane.heights, plane.on_slope
         )
@@ -99,8 +101,8 @@ class RoughGround(Cause):
         plane = signals.legs.plane
         if len(plane.time) < MIN_ROWS:
             return None
-        off = plane.heights - plane.on_slope
-        value = float(np.percentile(np.abs(off), 80))
+        off = np.abs(plane.heights - plane.on_slope)
+        value = max((float(np.percentile(off[rows], 80)) for rows in _windows(plane.time)), default=0.0)
         trace = Trace(
             "height between planted feet and on their mean slope, m",
             plane.time,
@@ -108,9 +110,18 @@ class RoughGround(Cause):
             plane.on_slope,
         )
         sentence = (
-            f"one in five pairs of planted feet lies more than {100 * value:.1f} cm off their mean slope"
+            f"for {WINDOW_S:g} s one in five pairs of planted feet lies more than {100 * value:.1f} cm off "
+            "their mean slope"
         )
-        return Measurement(value, sentence, worst_span(plane.time, np.abs(off)), (trace,))
+        return Measurement(value, sentence, worst_span(plane.time, off), (trace,))
+
+
+def _windows(time: Array) -> Iterator[slice]:
+    """Rows of each WINDOW_S, every half of it, with MIN_ROWS at least."""
+    for begin in np.arange(time[0], time[-1] - 0.5 * WINDOW_S, 0.5 * WINDOW_S):
+        rows = slice(*np.searchsorted(time, (begin, begin + WINDOW_S)))
+        if rows.stop - rows.start >= MIN_ROWS:
+            yield rows
 
 
 class Payload(Cause):

@@ -21,6 +21,8 @@ MAX_COMMANDS_LATE = 4
 """Largest number of state periods by which a drive may be behind to be tried."""
 LOST_ERROR = 6.0
 """Mean square error of the torques, in variances of the fit, from which a state is suspicious."""
+VISIBLE = 2.0
+"""Change of the torque between two commands, by LOST_ERROR, from which a lost command shows."""
 LOST_BETTER = 6.0
 """Factor by which an older command must reduce the error of a suspicious state."""
 MIN_TICKS = 20
@@ -142,20 +144,27 @@ class LostCommands(Cause):
             return None
         gain = np.array([fit.command for fit in model.fits])
 
-        def error(steps: int) -> Array:
-            # Mean over sound joints of ((tau - modelled torque) / spread)^2, if every command acts
-            # `steps` state periods later than the model has it.
-            asked = model.asked_at(model.delay + steps * run.period) - model.asked
-            off = (run.tau - model.modelled - gain * asked)[:, sound] / spread[sound]  # type: ignore[operator]
-            return np.asarray(np.mean(np.minimum(np.abs(off), 30.0) ** 2, axis=1))
+        def change(steps: int) -> Array:
+            # Torque, if every command acts `steps` state periods later than the model has it, less the model's.
+            return np.asarray(gain * (model.asked_at(model.delay + steps * run.period) - model.asked))
 
-        own = error(0)
-        older = np.min([error(steps) for steps in range(1, MAX_COMMANDS_LATE + 1)], axis=0)
+        def error(torque: Array) -> Array:
+            # Mean over sound joints of (torque / spread)^2
+            return np.asarray(np.mean(np.minimum(np.abs(torque / spread)[:, sound], 30.0) ** 2, axis=1))
+
+        left = run.tau - model.modelled
+        own = error(left)
+        older = np.min([error(left - change(steps)) for steps in range(1, MAX_COMMANDS_LATE + 1)], axis=0)
+        # Where the command hardly changes, a lost one does not show.
         lost = keep & (own > LOST_ERROR) & (own > LOST_BETTER * older)
-        share = float(lost.sum() / max(keep.sum(), 1))
+        shows = lost | (keep & (error(change(1)) > VISIBLE * LOST_ERROR))
+        share = float(lost.sum() / max(shows.sum(), MIN_TICKS))
         j = int(np.argmax(np.where(sound, np.abs(run.tau[lost] - model.modelled[lost]).sum(axis=0), -1.0)))
         trace = joint_trace(signals, j, model.modelled[:, j])
-        sentence = f"in {100 * share:.0f} % of the states the torques follow an older command"
+        sentence = (
+            f"in {100 * share:.0f} % of the states in which a command clearly changes the torques, they follow an "
+            "older one"
+        )
         return Measurement(share, sentence, worst_span(run.time, lost.astype(float)), (trace,))
 
 
