@@ -40,7 +40,7 @@ REORDERINGS = {
     "FL, FR, RL, RR, grouped by kind of joint": (3, 0, 9, 6, 4, 1, 10, 7, 5, 2, 11, 8),
 }
 """Orders of twelve joints that other stacks use, as indices into ours."""
-MEMORY_S = 0.7
+MEMORY_S = 1.1
 """Time from the start of a walk after which the network has forgotten what it held before."""
 
 

@@ -32,10 +32,10 @@ A target is then not the action of the policy; neither is one with a torque near
 """
 NEAR_LIMIT = 0.98
 """Share of a limit from which it may have changed the target."""
-TRIMMED_SHARE, TRIMMED_TICKS = 0.05, 100
-"""Share of the targets of so many ticks, those furthest off, that an error leaves out.
+LEFT_OUT_JOINTS = 2
+"""Joints of each tick, those furthest off, that an error leaves out.
 
-Limits act on single targets of a robot that falls. A wrong memory acts on all, but for half a second only.
+Limits act on single joints of a robot that falls, a wrong observation or memory on all.
 """
 BEFORE_FAULT_S = 0.25
 """Time before a fault, s, in which guards may already replace velocity and command."""
@@ -95,7 +95,7 @@ class Replay:
 
     @cached_property
     def error(self) -> float:
-        """Trimmed root mean square of recorded minus expected targets, rad."""
+        """Root mean square of recorded minus expected targets, of all but LEFT_OUT_JOINTS in each tick, rad."""
         return self.error_from(0)
 
     def error_from(self, first: int) -> float:
@@ -105,18 +105,14 @@ class Replay:
             first: First tick.
 
         Returns:
-            Root mean square without the largest TRIMMED_SHARE of each TRIMMED_TICKS, rad; NaN without
+            Root mean square without the LEFT_OUT_JOINTS furthest off in each tick, rad; NaN without
             valid ticks.
         """
         valid = self.valid[first:]
         if valid.sum() < MIN_TICKS:
             return float("nan")
-        squares = (self.recorded[first:] - self.expected[first:]) ** 2
-        kept = []
-        for rows in np.array_split(np.arange(len(valid)), -(-len(valid) // TRIMMED_TICKS)):
-            block = np.sort(squares[rows][valid[rows]])
-            kept.append(block[: round((1.0 - TRIMMED_SHARE) * len(block))])
-        return float(np.sqrt(np.mean(np.concatenate(kept))))
+        squares = np.where(valid, (self.recorded[first:] - self.expected[first:]) ** 2, np.nan)
+        return float(np.sqrt(np.nanmean(np.sort(squares, axis=1)[:, :-LEFT_OUT_JOINTS])))
 
 
 class PolicyReplay:
