@@ -116,7 +116,7 @@ def _action_factor(replay: PolicyReplay) -> tuple[float, float]:
     base, offset = replay.base, np.array(replay.policy.metadata.action_offset)
     x, y = (base.expected - offset)[base.valid], (base.recorded - offset)[base.valid]
     factor = float(x @ y / (x @ x))
-    return factor, float(np.sqrt(np.mean((y - factor * x) ** 2)))
+    return factor, attrs.evolve(base, expected=offset + factor * (base.expected - offset)).error
 
 
 def _variants(replay: PolicyReplay) -> Iterator[tuple[str, Sequence[Variant]]]:

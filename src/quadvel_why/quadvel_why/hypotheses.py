@@ -22,8 +22,10 @@ from .run import Run
 
 VELOCITY_SCALE_M_S, HEIGHT_SCALE_M = 0.05, 0.003
 """Contradictions that weigh alike; twice what a healthy walk shows."""
-CLEAR_VELOCITY_M_S, CLEAR_HEIGHT_M = 0.3, 0.04
-"""From which on the usual conventions are doubted: a wrong zero moves a foot by less."""
+HEALTHY, DOUBTED = 1.2, 2.0
+"""Contradiction up to which legs agree, and from which the usual conventions are doubted; healthy walks show 0.9."""
+CLEAR_HEIGHT_M = 0.01
+"""Unevenness that sliding feet do not cause."""
 EXCHANGE, EXCHANGED_SIDES = "left and right legs exchanged", -0.3
 """Correlation of roll moment and roll below which the sides are exchanged; healthy walks show 0.3 to 0.7."""
 MIN_IMPROVEMENT = 0.4
@@ -32,6 +34,8 @@ SLOPE_SHARE = 0.1
 """Share of the unevenness that a slope leaves if it explains it."""
 MIN_PAIR_ROWS = 40
 """Fewest rows with two planted feet that give a contradiction."""
+OFFSET_SHARE = 0.8
+"""Share of the unevenness that a wrong zero leaves at most; in healthy walks 0.96."""
 OFFSET_ROUNDS = 8
 """Iterations of the fit of an offset."""
 
@@ -113,7 +117,7 @@ def best_convention(run: Run) -> tuple[Tried | None, Tried]:
         return None, usual
     if usual.legs.roll_balance < EXCHANGED_SIDES:
         return _tried(run, EXCHANGE), usual
-    if not (usual.legs.disagreement > CLEAR_VELOCITY_M_S or usual.legs.unevenness > CLEAR_HEIGHT_M):
+    if usual.contradiction < DOUBTED:
         return None, usual
     if (
         usual.legs.unevenness > CLEAR_HEIGHT_M
@@ -121,9 +125,11 @@ def best_convention(run: Run) -> tuple[Tried | None, Tried]:
     ):
         return None, usual  # the feet lie on one slope
     best = min((_tried(run, name) for name in CONVENTIONS), key=lambda each: each.contradiction)
+    # Velocities alone contradict each other where feet slide, heights alone on a slope.
+    explains = best.contradiction < HEALTHY or usual.legs.unevenness > CLEAR_HEIGHT_M
     contradicts_more = best.legs.disagreement > max(usual.legs.disagreement, VELOCITY_SCALE_M_S)
-    if best.contradiction > MIN_IMPROVEMENT * usual.contradiction or contradicts_more:
-        return None, usual  # heights alone contradict each other on a slope, too
+    if best.contradiction > MIN_IMPROVEMENT * usual.contradiction or contradicts_more or not explains:
+        return None, usual
     return best, usual
 
 
@@ -191,7 +197,7 @@ def best_offset(legs: Legs) -> OffsetFit | None:
     # Rows of one step are no independent observations: a tenth of them counts.
     doubt = after / max(lever, 1e-6) / np.sqrt(max(weight.sum() / 10.0, 1.0))
     offset = float(found[2])
-    size = max(abs(offset) - 3.0 * doubt, 0.0) if after < 0.6 * before else 0.0
+    size = max(abs(offset) - 3.0 * doubt, 0.0) if after < OFFSET_SHARE * before else 0.0
     return OffsetFit(joint, offset, size, before, after, times, heights, plane @ base)
 
 

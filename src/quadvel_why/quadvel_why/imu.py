@@ -26,6 +26,8 @@ VERTICAL_WINDOW_S = 0.4
 """Of the mean acceleration: longer than a step."""
 TURN_SCALE_RAD, VERTICAL_SCALE_RAD = 0.01, 0.1
 """Errors that weigh alike; ten times what a healthy walk shows."""
+CLEARLY_BETTER = 1.5
+"""Factor by which a convention of one sensor has to fit better than all of the other to be told apart."""
 DEGREES = 180.0 / np.pi
 QUATERNIONS: Mapping[str, Callable[[Array], Array]] = {
     "w, x, y, z": lambda q: q,
@@ -93,6 +95,10 @@ class Hypothesis:
         return (self.quaternion, self.gyroscope) == (USUAL_QUATERNION, USUAL_GYROSCOPE)
 
 
+def _error(hypothesis: Hypothesis) -> float:
+    return hypothesis.error
+
+
 class ImuHypotheses:
     """All hypotheses on one run with an IMU."""
 
@@ -110,9 +116,22 @@ class ImuHypotheses:
     @cached_property
     def best(self) -> Hypothesis:
         """The hypothesis that fits best; only one of both sensors deviates."""
-        tried = [self._hypothesis(name, USUAL_GYROSCOPE) for name in QUATERNIONS]
-        tried += [self._hypothesis(USUAL_QUATERNION, name) for name in (*GYROSCOPES, IN_WORLD)]
-        return min(tried, key=lambda hypothesis: hypothesis.error)
+        return min(self._best_quaternion, self._best_gyroscope, key=_error)
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether a reading of the quaternion and one of the gyroscope fit about equally."""
+        low, high = sorted((self._best_quaternion.error, self._best_gyroscope.error))
+        return high < CLEARLY_BETTER * low
+
+    @cached_property
+    def _best_quaternion(self) -> Hypothesis:
+        return min((self._hypothesis(name, USUAL_GYROSCOPE) for name in QUATERNIONS), key=_error)
+
+    @cached_property
+    def _best_gyroscope(self) -> Hypothesis:
+        names = (*GYROSCOPES, IN_WORLD)
+        return min((self._hypothesis(USUAL_QUATERNION, name) for name in names), key=_error)
 
     def turns(self, quaternion: str) -> Array:
         """Return the turns of the trunk over windows of m states.

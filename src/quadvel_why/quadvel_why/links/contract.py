@@ -380,7 +380,7 @@ class QuaternionOrder(Cause):
         imu = signals.imu
         if imu.best.quaternion == USUAL_QUATERNION:
             return Measurement(1.0)
-        return _imu_measurement(signals, imu.best.quaternion, USUAL_GYROSCOPE)
+        return _imu_measurement(signals, imu.best.quaternion, USUAL_GYROSCOPE, "gyro_frame")
 
 
 class GyroFrame(Cause):
@@ -397,7 +397,7 @@ class GyroFrame(Cause):
         imu = signals.imu
         if imu.best.gyroscope == USUAL_GYROSCOPE:
             return Measurement(1.0)
-        return _imu_measurement(signals, USUAL_QUATERNION, imu.best.gyroscope)
+        return _imu_measurement(signals, USUAL_QUATERNION, imu.best.gyroscope, "quaternion_order")
 
 
 def turn_evidence(signals: Signals) -> tuple[Trace, tuple[float, float]]:
@@ -418,7 +418,7 @@ def turn_evidence(signals: Signals) -> tuple[Trace, tuple[float, float]]:
     return trace, worst_span(middle, np.linalg.norm(turns - expected, axis=1))
 
 
-def _imu_measurement(signals: Signals, quaternion: str, gyroscope: str) -> Measurement:
+def _imu_measurement(signals: Signals, quaternion: str, gyroscope: str, other: str) -> Measurement:
     """Improvement by other conventions, with the axis that differs most as a picture."""
     usual, best = signals.imu.usual, signals.imu.best
     if usual.error < MIN_IMU_ERROR:
@@ -426,7 +426,9 @@ def _imu_measurement(signals: Signals, quaternion: str, gyroscope: str) -> Measu
     trace, span = turn_evidence(signals)
     what = f"as {quaternion}" if quaternion != USUAL_QUATERNION else f"with the gyroscope as {gyroscope}"
     sentence = f"{usual}; read {what}: {best}"
-    return Measurement(usual.error / max(best.error, 1e-6), sentence, span, (trace,))
+    experiment = "tilt the robot by hand about one axis after the other: the gyroscope shows its own axis"
+    alternatives = ((other, experiment),) if signals.imu.is_ambiguous else ()
+    return Measurement(usual.error / max(best.error, 1e-6), sentence, span, (trace,), alternatives)
 
 
 MIN_IMU_ERROR = 1.5
