@@ -188,11 +188,19 @@ def test_a_pickle_is_refused_with_the_line_that_converts_it(
 
 
 @pytest.mark.parametrize(
-    "name", ["log.xlsx", "log.feather", "log.zip", "log.jsonl", "log.unknown", "log", "log.mcap.gz"]
+    "name",
+    ["log.xlsx", "log.feather", "log.zip", "log.jsonl", "log.db3.zstd", "log.unknown", "log", "log.mcap.gz"],
 )
 def test_unsupported_format_is_refused_by_its_suffix(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"x")
     with pytest.raises(LogError, match=r"the suffix is '.*': |the suffix is '.*', expected"):
+        read_log(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["log.db3.zstd", "log.csv.zst"])
+def test_compressed_file_is_refused_with_the_line_that_unpacks_it(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(LogError, match=f"zstd -d '{name}' -o '{Path(name).stem}'"):
         read_log(tmp_path / name)
 
 

@@ -33,7 +33,8 @@ CONVERSIONS: Mapping[str, tuple[str, str]] = {
     **dict.fromkeys((".xlsx", ".xls", ".ods"), (_CONVERTED, _PANDAS.replace("{reader}", "read_excel('{name}')"))),
     **dict.fromkeys((".feather", ".arrow"), (_CONVERTED, _PANDAS.replace("{reader}", "read_feather('{name}')"))),
     **dict.fromkeys((".jsonl", ".ndjson"), (_CONVERTED, _PANDAS.replace("{reader}", "read_json('{name}', lines=True)"))),
-    **dict.fromkeys((".zip", ".zst", ".xz", ".bz2"), (_CONVERTED, "unpack it")),
+    **dict.fromkeys((".zip", ".xz", ".bz2"), (_CONVERTED, "unpack it")),
+    **dict.fromkeys((".zst", ".zstd"), (_CONVERTED, "zstd -d '{name}' -o '{stem}'")),
 }  # fmt: skip
 """By suffix: why a file is not read, and a command that converts it."""
 
@@ -49,7 +50,7 @@ def unreadable_reason(path: Path, known: Collection[str]) -> str:
         The sentence, with a command that converts the file if there is one.
     """
     reason, command = CONVERSIONS.get(path.suffix.lower(), ("", ""))
-    command = command.replace("{name}", path.name)
+    command = command.replace("{name}", path.name).replace("{stem}", path.stem)
     if reason:
         return f"{path}: the suffix is '{path.suffix}': {reason.format(command=command)}"
     listed = ", ".join((".mcap", ".db3", ".bag", *known))
