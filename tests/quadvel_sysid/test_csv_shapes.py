@@ -124,6 +124,28 @@ def check(log: Log) -> None:
         np.testing.assert_allclose(values[:, 0], ROWS[:, column], atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    "tail", ["0.3,nan,nan,nan,nan", "0.3,0.1,0.2,,", "0.3,,0.2,0.1,1", ",0.1,0.2,0.3,1", "0.3,1,-,1,1"]
+)
+@pytest.mark.parametrize("count", [1, 3])
+def test_rows_that_lack_a_value_at_the_end_are_left_out_with_a_note(
+    tmp_path: Path, tail: str, count: int
+) -> None:
+    (tmp_path / "log.csv").write_text(PLAIN + f"{tail}\n" * count)
+    log = read_log(tmp_path / "log.csv")
+    check(log)
+    assert any(f"last {count} of {60 + count} rows" in text for text in log.remarks)
+
+
+def test_column_that_ends_halfway_is_refused_by_its_row(tmp_path: Path) -> None:
+    lines = PLAIN.splitlines()
+    (tmp_path / "log.csv").write_text(
+        "\n".join([*lines[:21], *(line.rpartition(",")[0] + "," for line in lines[21:])])
+    )
+    with pytest.raises(LogError, match=r"log\.csv: tau: .* row 20 "):
+        read_log(tmp_path / "log.csv")
+
+
 def test_unused_column_is_named_in_a_note(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(SHAPES["stages"])  # type: ignore[arg-type]
     assert any(text.startswith("stage: not used") for text in read_log(tmp_path / "log.csv").remarks)
