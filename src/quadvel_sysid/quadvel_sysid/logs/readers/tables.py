@@ -39,12 +39,16 @@ def read_table(path: Path, names: ColumnMap) -> Log:
     """
     fields, joints, remarks = read_fields(path, names)
     check_size(path, {name: np.shape(values) for name, values in fields.items()})
-    for name in ("t", "q"):
+    pickled = next((one for one in remarks if "a pickle" in one), "")
+    for name in ("t", "q", "q_des") if pickled and "q_des_cmd" not in fields else ("t", "q"):
         if name not in fields:
             there = ", ".join(fields) or "none"
+            if pickled:
+                raise LogError(f"{path}: {name}: the field is missing, found {there}; {pickled}")
             more = next((one for one in remarks if "not used" in one), "").partition("such fields: ")[2]
             more = f"; of {more}, --columns MAPFILE says which is what" if more else ""
             raise LogError(f"{path}: {name}: the field is missing, found {there}{more}")
+    remarks = [one for one in remarks if one != pickled]
     return _log(path, _cut_incomplete_rows(path, fields, remarks), joints, remarks)
 
 
