@@ -234,8 +234,30 @@ def test_ways_that_are_too_long_are_refused_before_they_take_memory(
 
 
 def test_a_gpx_beyond_the_poles_is_refused_by_its_point(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"point 2 at \(91, 0\)"):
+    with pytest.raises(ValueError, match=r"point 2 at \(91"):
         load_trajectory(gpx(tmp_path, np.array([[90.0, 0.0], [91.0, 0.0]])), 0.5)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    ['lat="nan" lon="nan"', 'lat="60" lon="nan"', 'lat="inf" lon="10"', 'lat="60"', "", 'lat="60,1" lon="x"'],
+)
+@pytest.mark.parametrize("place", [0, 5, 19])
+def test_a_bad_point_of_a_gpx_is_named(tmp_path: Path, bad: str, place: int) -> None:
+    marks = [f'<trkpt lat="60.0" lon="{10.0 + 1e-4 * k}"/>' for k in range(20)]
+    marks[place] = f"<trkpt {bad}/>"
+    file = tmp_path / "way.gpx"
+    file.write_text(f"<gpx><trk><trkseg>{''.join(marks)}</trkseg></trk></gpx>")
+    with pytest.raises(ValueError, match=rf"way\.gpx: has point {place + 1} at .*, expected a lat"):
+        load_trajectory(file, 0.5)
+
+
+@pytest.mark.parametrize("marks", ["", '<trkpt lat="60" lon="10"/>'])
+def test_a_gpx_of_less_than_two_points_is_refused_with_their_count(tmp_path: Path, marks: str) -> None:
+    file = tmp_path / "way.gpx"
+    file.write_text(f"<gpx><trk><trkseg>{marks}</trkseg></trk></gpx>")
+    with pytest.raises(ValueError, match=rf"has {int(bool(marks))} points, expected 2"):
+        load_trajectory(file, 0.5)
 
 
 @pytest.mark.parametrize(

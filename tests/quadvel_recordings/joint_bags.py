@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from quadvel_recordings.definitions import STORE
@@ -114,8 +114,16 @@ def own(zeros: Sequence[int]) -> list[Message]:
     return messages
 
 
-def rosbag2(path: Path, messages: Sequence[Message], storage: StoragePlugin = StoragePlugin.MCAP) -> Path:
-    with Writer(path, version=9, storage_plugin=storage) as writer:
+def rosbag2(
+    path: Path,
+    messages: Sequence[Message],
+    storage: StoragePlugin = StoragePlugin.MCAP,
+    compression: CompressionMode = CompressionMode.NONE,
+) -> Path:
+    writer = Writer(path, version=9, storage_plugin=storage)
+    if compression != CompressionMode.NONE:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
         channels: dict[str, Any] = {}
         for topic, kind, now, message in messages:
             if topic not in channels:

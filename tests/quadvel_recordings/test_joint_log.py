@@ -11,7 +11,7 @@ import lz4.frame
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_recordings import bounds
@@ -145,7 +145,7 @@ def at(message: Any, nanoseconds: int) -> Any:
 
 
 @pytest.mark.parametrize("storage", list(StoragePlugin))
-@pytest.mark.parametrize("fault", ["no metadata", "''", "", "null", "rosbag_v9"])
+@pytest.mark.parametrize("fault", ["no metadata", "''", "", "null", "rosbag_v9", "other"])
 def test_the_kind_of_storage_is_taken_from_the_files(
     tmp_path: Path, storage: StoragePlugin, fault: str
 ) -> None:
@@ -154,13 +154,84 @@ def test_the_kind_of_storage_is_taken_from_the_files(
     if fault == "no metadata":
         metadata.unlink()
     else:
-        name = "mcap" if storage == StoragePlugin.MCAP else "sqlite3"
+        name, other = ("mcap", "sqlite3") if storage == StoragePlugin.MCAP else ("sqlite3", "mcap")
+        fault = other if fault == "other" else fault
         text = metadata.read_text()
         metadata.write_text(text.replace(f"storage_identifier: {name}", f"storage_identifier: {fault}"))
         assert metadata.read_text() != text
     said: list[str] = []
     check(read_joint_log(path, notify=said.append))
     assert "metadata.yaml" in said[0]
+    assert "topics" not in said[0]
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+@pytest.mark.parametrize("lines", [0, 1, 7, 11, -6, -1])
+def test_cut_metadata_is_reported_and_the_data_are_read(
+    tmp_path: Path, storage: StoragePlugin, lines: int
+) -> None:
+    path = rosbag2(tmp_path / "bag", own(()), storage)
+    metadata = path / "metadata.yaml"
+    metadata.write_text("\n".join(metadata.read_text().splitlines()[:lines]))
+    said: list[str] = []
+    check(read_joint_log(path, notify=said.append))
+    assert "metadata.yaml" in said[0]
+    for file in path.glob("bag*"):
+        file.unlink()
+    with pytest.raises(RecordingError, match=r"metadata\.yaml is (empty|cut off)"):
+        read_joint_log(path)
+
+
+@pytest.mark.parametrize("end", ["  extra:", "  ext"])
+def test_metadata_that_end_within_a_line_are_reported_and_the_data_are_read(tmp_path: Path, end: str) -> None:
+    path = rosbag2(tmp_path / "bag", own(()))
+    with (path / "metadata.yaml").open("a") as metadata:
+        metadata.write(end)
+    said: list[str] = []
+    check(read_joint_log(path, notify=said.append))
+    assert "cut off" in said[0]
+
+
+def test_renamed_file_of_a_folder_is_read_with_a_note(tmp_path: Path) -> None:
+    path = rosbag2(tmp_path / "bag", own(()))
+    (path / "bag.mcap").rename(path / "walk.mcap")
+    said: list[str] = []
+    check(read_joint_log(path, notify=said.append))
+    assert "walk.mcap" in said[0]
+
+
+def test_first_bytes_of_a_file_count_more_than_its_suffix(tmp_path: Path) -> None:
+    path = rosbag2(tmp_path / "bag", own(()))
+    (path / "bag.mcap").rename(path / "bag.db3")
+    check(read_joint_log(path / "bag.db3"))
+    metadata = path / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("bag.mcap", "bag.db3").replace(": mcap", ": sqlite3"))
+    check(read_joint_log(path, notify=lambda _: None))
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+@pytest.mark.parametrize("metadata", [True, False])
+def test_compressed_messages_are_read_with_and_without_metadata(
+    tmp_path: Path, storage: StoragePlugin, metadata: bool
+) -> None:
+    path = rosbag2(tmp_path / "bag", own(()), storage, CompressionMode.MESSAGE)
+    if not metadata:
+        (path / "metadata.yaml").unlink()
+    check(read_joint_log(path, notify=lambda _: None))
+
+
+@pytest.mark.parametrize("metadata", [None, "", "rosbag2_bagfile_information:\n  version: 9\n"])
+def test_compressed_file_without_metadata_is_refused_with_the_way_to_unpack_it(
+    tmp_path: Path, metadata: str | None
+) -> None:
+    path = rosbag2(tmp_path / "bag", own(()), StoragePlugin.SQLITE3, CompressionMode.FILE)
+    check(read_joint_log(path))
+    (path / "metadata.yaml").unlink()
+    if metadata is not None:
+        (path / "metadata.yaml").write_text(metadata)
+    for place in (path, path / "bag.db3.zstd"):
+        with pytest.raises(RecordingError, match=r"zstd -d bag\.db3\.zstd"):
+            read_joint_log(place)
 
 
 def test_other_topics_are_listed_where_no_joints_are(tmp_path: Path) -> None:

@@ -71,6 +71,9 @@ SHAPES: dict[str, str | bytes] = {
     "spaces": table(" "),
     "savetxt": "# " + table(" "),
     "savetxt with commas": "# a note\n# " + PLAIN,
+    "more numbered columns than names": "".join(
+        f"{line},{','.join('01234567')}\n" for line in PLAIN.splitlines()),
+    "savetxt with text": "# " + with_column(PLAIN, "stage", lambda k: "chirp" if k < 30 else "sine"),
     "separator named": "sep=;\n" + table(";"),
     "spaces behind commas": PLAIN.replace(",", ", "),
     "commas at the line ends": PLAIN.replace("\n", ",\n"),
@@ -121,6 +124,28 @@ def check(log: Log) -> None:
         np.testing.assert_allclose(values[:, 0], ROWS[:, column], atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    "tail", ["0.3,nan,nan,nan,nan", "0.3,0.1,0.2,,", "0.3,,0.2,0.1,1", ",0.1,0.2,0.3,1", "0.3,1,-,1,1"]
+)
+@pytest.mark.parametrize("count", [1, 3])
+def test_rows_that_lack_a_value_at_the_end_are_left_out_with_a_note(
+    tmp_path: Path, tail: str, count: int
+) -> None:
+    (tmp_path / "log.csv").write_text(PLAIN + f"{tail}\n" * count)
+    log = read_log(tmp_path / "log.csv")
+    check(log)
+    assert any(f"last {count} of {60 + count} rows" in text for text in log.remarks)
+
+
+def test_column_that_ends_halfway_is_refused_by_its_row(tmp_path: Path) -> None:
+    lines = PLAIN.splitlines()
+    (tmp_path / "log.csv").write_text(
+        "\n".join([*lines[:21], *(line.rpartition(",")[0] + "," for line in lines[21:])])
+    )
+    with pytest.raises(LogError, match=r"log\.csv: tau: .* row 20 "):
+        read_log(tmp_path / "log.csv")
+
+
 def test_unused_column_is_named_in_a_note(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(SHAPES["stages"])  # type: ignore[arg-type]
     assert any(text.startswith("stage: not used") for text in read_log(tmp_path / "log.csv").remarks)
@@ -165,6 +190,44 @@ def test_a_table_that_is_none_is_refused_by_line_and_column(tmp_path: Path, text
     (tmp_path / "log.csv").write_text(text)
     with pytest.raises(LogError, match=rf"log\.csv: .*{sentence}"):
         read_log(tmp_path / "log.csv")
+
+
+def bare_rows(separator: str = ",", number: Callable[[float], str] = str) -> list[str]:
+    return table(separator, number=number).splitlines()[1:]
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [f"{row},chirp" for row in bare_rows()],
+        [f"True,{row},False" for row in bare_rows()],
+        [f"{row}," for row in bare_rows()],
+        [f",{row},," for row in bare_rows()],
+        [f"{row},NaN,null" for row in bare_rows()],
+        [f"{row};chirp" for row in bare_rows(";", with_comma)],
+        [f"{row}\tTrue" for row in bare_rows("\t", with_comma)],
+        [f"{row} chirp" for row in bare_rows(" ")],
+        [f'{row},"[1, 2]",position' for row in bare_rows()],
+        bare_rows(number=date),
+        bare_rows(number=lambda x: date(x).replace("T", " ")),
+        bare_rows(number=lambda x: date(x).partition("T")[2] or str(x)),
+        [f"2026/03/01 10:00:{k},{row}" for k, row in enumerate(bare_rows())],
+    ],
+)
+def test_rows_without_a_head_are_refused_as_such(tmp_path: Path, rows: list[str]) -> None:
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    with pytest.raises(LogError, match=r"line 1: .* no head"):
+        read_log(tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize("head", ["0,1,2,3,4", ",0,1,2,3,4", "t,1,2,3,4"])
+def test_numbers_as_names_of_columns_are_a_head_if_a_map_names_them(tmp_path: Path, head: str) -> None:
+    rows = [f"{k},{row}" if head.startswith(",") else row for k, row in enumerate(bare_rows())]
+    (tmp_path / "log.csv").write_text("\n".join([head, *rows]) + "\n")
+    time = "t" if "t" in head else "0"
+    names = {"t": time, "q": "1", "dq": "2", "q_des": "3", "tau": "4"}
+    sources = {field: Source((column,)) for field, column in names.items()}
+    check(read_log(tmp_path / "log.csv", names=ColumnMap(sources, ("knee",))))
 
 
 @pytest.mark.parametrize("line", [b"\n", b"# comment\n", b"1,2,3\n", b"0" * 999_000 + b",1,1\n", b"0"])

@@ -156,43 +156,84 @@ def test_missing_optional_dependency_is_named(
         read_log(tmp_path / name)
 
 
-def pickled(path: Path) -> None:
-    path.write_bytes(pickle.dumps(GIVEN))
+def rows() -> list[dict[str, Any]]:
+    return [
+        {name: float(values[k]) if name == "t" else list(values[k]) for name, values in GIVEN.items()}
+        for k in range(len(GIVEN["t"]))
+    ]
 
 
-def torch_saved(path: Path) -> None:
-    torch = pytest.importorskip("torch", reason="torch is not installed")
-    torch.save({name: torch.tensor(values) for name, values in GIVEN.items()}, path)
+def pickled(content: Any) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        path.write_bytes(pickle.dumps(content))
+
+    return write
 
 
-@pytest.mark.parametrize(
-    ("name", "write"),
-    [
-        ("log.pkl", pickled),
-        ("log.pt", torch_saved),
-        ("log.npy", lambda path: np.save(path, GIVEN)),  # type: ignore[arg-type]
-        ("dict.npz", lambda path: np.savez(path, log=np.array(GIVEN, dtype=object))),
-    ],
-)
-def test_a_pickle_is_refused_with_the_line_that_converts_it(
-    tmp_path: Path, name: str, write: Callable[[Path], None]
-) -> None:
+def objects(content: Any) -> np.ndarray:
+    return np.array(content, dtype=object)
+
+
+def torch_saved(convert: Callable[[Any], Any]) -> Callable[[Path], None]:
+    """Writer of a file of PyTorch; `convert` makes its content from a dict of tensors."""
+
+    def write(path: Path) -> None:
+        torch = pytest.importorskip("torch", reason="torch is not installed")
+        torch.save(convert({name: torch.tensor(values) for name, values in GIVEN.items()}), path)
+
+    return write
+
+
+COMMANDLESS = {name: values for name, values in GIVEN.items() if name != "q_des"}
+PICKLES: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "dict": ("log.pkl", pickled(GIVEN)),
+    "nested dicts": ("log.pkl", pickled({"config": {"kp": [1.0]}, "runs": {"first": GIVEN, "n": 1}})),
+    "dict and its units": ("log.pickle", pickled(GIVEN | {"units": dict.fromkeys(GIVEN, "SI") | {"seed": "-"}})),
+    "list of dicts": ("log.pkl", pickled(rows())),
+    "nested list of dicts": ("log.pkl", pickled({"rate": 200.0, "steps": rows()})),
+    "list of nested dicts": ("log.pkl", pickled([{"t": row.pop("t"), "joints": row} for row in rows()])),
+    "tensors": ("log.pt", torch_saved(dict)),
+    "nested tensors": ("log.pth", torch_saved(lambda log: {"log": log, "epoch": 3})),
+    "arrays of NumPy": ("log.pt", torch_saved(lambda _: GIVEN)),
+    "list in a file of PyTorch": ("log.pt", torch_saved(lambda _: rows())),
+    "array of a dict": ("log.npy", lambda path: np.save(path, objects(GIVEN))),
+    "array of dicts": ("log.npy", lambda path: np.save(path, objects(rows()))),
+    "archive of a dict": ("dict.npz", lambda path: np.savez(path, log=objects(GIVEN))),
+    "archive of a dict and times": ("dict.npz", lambda path: np.savez(path, log=objects(GIVEN), t=GIVEN["t"])),
+    "archive of commands in a dict": (
+        "log.npz", lambda path: np.savez(path, **COMMANDLESS, commands=objects({"q_des": GIVEN["q_des"]}))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", PICKLES)
+def test_a_pickle_is_refused_with_the_line_that_converts_it(tmp_path: Path, kind: str) -> None:
+    name, write = PICKLES[kind]
     write(tmp_path / name)
+    content = (tmp_path / name).read_bytes()
     with pytest.raises(LogError, match="pickle") as refusal:
         read_log(tmp_path / name)
     line = re.search(r"python -c .*", str(refusal.value))
     assert line is not None
     program = shlex.split(line[0])[2]
     subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=True)
-    check(read_log(tmp_path / "log.npz"), ["1", "2"])
+    assert (tmp_path / name).read_bytes() == content
+    check(read_log(tmp_path / ("log_arrays.npz" if name == "log.npz" else "log.npz")), ["1", "2"])
 
 
 @pytest.mark.parametrize(
-    "name", ["log.xlsx", "log.feather", "log.zip", "log.jsonl", "log.unknown", "log", "log.mcap.gz"]
+    "name",
+    ["log.xlsx", "log.feather", "log.zip", "log.jsonl", "log.db3.zstd", "log.unknown", "log", "log.mcap.gz"],
 )
 def test_unsupported_format_is_refused_by_its_suffix(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"x")
     with pytest.raises(LogError, match=r"the suffix is '.*': |the suffix is '.*', expected"):
+        read_log(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["log.db3.zstd", "log.csv.zst"])
+def test_compressed_file_is_refused_with_the_line_that_unpacks_it(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(LogError, match=f"zstd -d '{name}' -o '{Path(name).stem}'"):
         read_log(tmp_path / name)
 
 

@@ -248,6 +248,19 @@ def _load_csv(path: Path, speed: float) -> Trajectory:
     return Trajectory.from_commands(numbers[:, 0], numbers[:, 1:])
 
 
+def _parse_angles(point: ElementTree.Element, number: int) -> tuple[float, float]:
+    """Return latitude and longitude of a point of a GPX file, deg."""
+    texts = point.get("lat", "none"), point.get("lon", "none")
+    try:
+        lat, lon = map(float, texts)
+    except ValueError:
+        lat = lon = np.nan
+    if not (abs(lat) <= 90.0 and abs(lon) <= 360.0):
+        found = f"has point {number} at ({texts[0][:20]}, {texts[1][:20]})"
+        raise ValueError(f"{found}, expected a lat within 90 and a lon within 360 degrees")
+    return lat, lon
+
+
 def _load_gpx(path: Path, speed: float) -> Trajectory:
     """Return the trajectory of a GPX file."""
     text = path.read_text()
@@ -256,13 +269,9 @@ def _load_gpx(path: Path, speed: float) -> Trajectory:
     points = [
         e for e in ElementTree.fromstring(text).iter() if e.tag.rpartition("}")[2] in ("trkpt", "rtept")
     ]
-    angles = np.array([[float(e.get("lat", "nan")), float(e.get("lon", "nan"))] for e in points])
-    if len(angles) < 2 or not np.isfinite(angles).all():
-        raise ValueError("has less than two points with lat and lon")
-    if (wrong := np.flatnonzero((np.abs(angles) > [90.0, 360.0]).any(axis=1))).size:
-        raise ValueError(
-            f"has point {wrong[0] + 1} at {_pair_text(angles[wrong[0]])}, expected a lat within 90 and a lon within 360 degrees"
-        )
+    if len(points) < 2:
+        raise ValueError(f"has {len(points)} points, expected 2 or more trkpt or rtept with lat and lon")
+    angles = np.array([_parse_angles(point, number) for number, point in enumerate(points, 1)])
     directions = _unit_vectors(np.deg2rad(angles))
     chords = np.linalg.norm(np.diff(directions, axis=0), axis=1)
     _check_leaps(angles, 2.0 * EARTH_RADIUS_M * np.arcsin(np.minimum(0.5 * chords, 1.0)))

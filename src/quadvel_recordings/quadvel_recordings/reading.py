@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection, MessageDefinition
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag1.reader import decompressors
 from rosbags.rosbag2 import Reader
@@ -24,7 +24,16 @@ from .truncated import is_truncated, recover_messages, recovery_summary
 
 STORAGES = {".mcap": "mcap", ".db3": "sqlite3"}
 """Storage identifiers of metadata.yaml by suffix of the file."""
-
+MAGIC = {b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
+"""Suffixes by first bytes of the file; these count more than its name."""
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+"""First bytes of a compressed message; a serialised one begins with 0."""
+METADATA_KEYS = {
+    "version": r"\d",
+    "topics_with_message_count": r"[-\[]",
+    "relative_file_paths": r"(- *\S|\[)",
+}
+"""Keys without which metadata.yaml is of no use, and how their values begin."""
 
 DESCRIPTION_TOPIC = "/robot_description"
 """Topic of the robot's URDF, by which a recording names its robot."""
@@ -80,7 +89,7 @@ def lazy_messages(
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     for part in _recording_files(path, notify):
-        if part.suffix == ".mcap":
+        if part.is_file():
             _check_bounds(part, partial(check_chunks, part))
         if is_truncated(part):
             yield from _recovered_messages(part, wanted, notify)
@@ -131,27 +140,59 @@ def recorded_description(path: Path) -> str:
 
 
 def _recording_files(path: Path, notify: Callable[[str], None] | None) -> Sequence[Path]:
-    """Return the recording, or its files if metadata.yaml is missing or names no known storage."""
+    """Return the recording, or its files if metadata.yaml is missing or does not describe them."""
     if not path.is_dir():
+        if path.suffix == ".zstd":
+            raise RecordingError(f"{path}: {_unpack_advice(path)}")
         return [path]
-    files = sorted((one for one in path.iterdir() if one.suffix in STORAGES), key=_file_order)
+    files = _data_files(path)
     metadata = path / "metadata.yaml"
-    if not metadata.exists():
-        if not files:
-            raise RecordingError(
-                f"{path}: the folder is no recording: a rosbag2 folder holds a metadata.yaml"
-            )
-        reason = "metadata.yaml is missing"
-    else:
-        kind = re.search(
-            r"^\s*storage_identifier:\s*(.*?)\s*$", metadata.read_text(errors="replace"), re.MULTILINE
-        )
-        name = "mcap" if kind is None else kind[1].strip("\"'")
-        if not files or name in STORAGES.values():
-            return [path]
-        reason = f"metadata.yaml: storage_identifier is '{name}', expected mcap or sqlite3"
-    _report(path, f"recording: {reason}; read from {', '.join(one.name for one in files)}", notify)
-    return files
+    reason = _metadata_fault(metadata, files) if metadata.exists() else "metadata.yaml is missing"
+    if not reason:
+        return [path]
+    if files:
+        _report(path, f"recording: {reason}; read from {', '.join(one.name for one in files)}", notify)
+        return files
+    if packed := sorted(path.glob("*.zstd")):
+        raise RecordingError(f"{path}: {reason}; {_unpack_advice(packed[0])}")
+    if metadata.exists():
+        raise RecordingError(f"{path}: not a complete recording: {reason}")
+    raise RecordingError(f"{path}: the folder is no recording: a rosbag2 folder holds a metadata.yaml")
+
+
+def _data_files(folder: Path) -> list[Path]:
+    """Return the files of a recording that are not compressed, in the order of time."""
+    return sorted((one for one in folder.iterdir() if one.suffix in STORAGES), key=_file_order)
+
+
+def _unpack_advice(packed: Path) -> str:
+    """Return the command that decompresses a file."""
+    return f"{packed.name} is compressed; unpack it: zstd -d {packed.name} -o {packed.stem}"
+
+
+def _metadata_fault(metadata: Path, files: Sequence[Path]) -> str:
+    """Return how metadata.yaml is incomplete or contradicts the files; "" if it does neither."""
+    text = metadata.read_text(errors="replace")
+    for key, value in METADATA_KEYS.items():
+        if not re.search(rf"^[ \t]*{key}:\s*{value}", text, re.MULTILINE):
+            return f"metadata.yaml is {'cut off' if text.strip() else 'empty'}: {key} is missing"
+    if not re.search(r"[:-] [^\n]*\S\s*\Z", text):
+        return "metadata.yaml is cut off: its last line is incomplete"
+    found = re.search(r"^[ \t]*storage_identifier:[ \t]*(.*?)[ \t\r]*$", text, re.MULTILINE)
+    name = found[1].strip("\"'") if found else ""
+    expected = {STORAGES[_storage_suffix(one)] for one in files if one.is_file() and one.name in text}
+    if files and not expected:
+        return "metadata.yaml names none of the files"
+    if not files or name in expected:
+        return ""
+    return f"metadata.yaml: storage_identifier is '{name}', expected {' or '.join(sorted(expected))}"
+
+
+def _storage_suffix(path: Path) -> str:
+    """Return the suffix that fits the first bytes of a file, else its own."""
+    with path.open("rb") as file:
+        begin = file.read(max(map(len, MAGIC)))
+    return next((suffix for magic, suffix in MAGIC.items() if begin.startswith(magic)), path.suffix)
 
 
 def _file_order(path: Path) -> tuple[int, str]:
@@ -183,23 +224,37 @@ def _ros2_messages(
     if path.is_dir():
         for packed in sorted(path.glob("*.zstd")):
             _check_bounds(path, partial(check_packed_file, packed))
-        for chunked in sorted(path.glob("*.mcap")):
+        for chunked in _data_files(path):
             _check_bounds(path, partial(check_chunks, chunked))
     try:
-        with Reader(path) as reader:
+        with _reader(path) as reader:
             chosen = _select_connections(reader.connections, wanted)
             packed_messages = reader.compression_mode == "message"
             if packed_messages:
                 _check_messages(reader, chosen)
             # With an empty selection the reader would return all messages.
             for channel, time, data in reader.messages(chosen) if chosen else ():
-                yield channel.topic, time, partial(deserialize, data, channel.msgtype, channel.msgdef)
+                yield channel.topic, time, partial(_deserialize, data, channel.msgtype, channel.msgdef)
     except TooLargeError as error:
         raise RecordingError(f"{path}: {error}") from None
     except PermissionError:
         raise
     except Exception as error:  # a broken file fails anywhere in bag reader, decompression or deserialisation
         raise _unreadable(path, error) from error
+
+
+def _reader(path: Path) -> Reader:
+    """Return the reader of a folder, or of the storage that a file holds whatever its suffix is."""
+    reader = Reader(path)
+    if path.is_file():
+        reader.storage = Reader.STORAGE_PLUGINS[_storage_suffix(path)](path)
+    return reader
+
+
+def _deserialize(data: bytes, typename: str, definition: MessageDefinition) -> Any:
+    """Deserialise a message, which may be compressed by itself even if no metadata.yaml states so."""
+    whole = decompress(data, "zstd") if data[:4] == ZSTD_MAGIC else data
+    return deserialize(whole, typename, definition)
 
 
 def _check_messages(reader: Reader, chosen: Collection[Connection]) -> None:
@@ -263,4 +318,4 @@ def _recovered_messages(
     _report(path, text, notify)
     for one in recover_messages(path):
         if wanted(one.topic, one.typename) and is_known(one.typename, one.definition):
-            yield one.topic, one.time, partial(deserialize, one.data, one.typename, one.definition)
+            yield one.topic, one.time, partial(_deserialize, one.data, one.typename, one.definition)

@@ -6,6 +6,7 @@ import io
 import math
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ..log import LogError
+from .formats import unpickled
 from .names import JOINT_NAMES_FIELD
 from .raw import MAX_LINE_CHARS, ColumnChooser, RawArrays, as_numbers, check_size, check_type
 
@@ -31,16 +33,6 @@ ARCHIVE_ERRORS = (
     OverflowError,
 )
 """Exceptions of zipfile for an archive that is truncated, encrypted or packed in an unknown way."""
-PICKLE_MESSAGE = (
-    "{path}: {name}: found the type object, a pickle, which may run programs and is not read; "
-    "if you trust it: {command}"
-)
-"""Message for an array of pickled objects, with a command that converts it."""
-
-CONVERSION = (
-    'python -c "import numpy as np; '
-    "np.savez('log.npz', **np.load('{name}', allow_pickle=True){member}.item())\""
-)
 
 
 def read_npz(path: Path, choose: ColumnChooser) -> RawArrays:
@@ -60,15 +52,17 @@ def read_npz(path: Path, choose: ColumnChooser) -> RawArrays:
         with zipfile.ZipFile(path) as archive:
             there = [one.removesuffix(".npy") for one in archive.namelist() if one.endswith(".npy")]
             chosen = choose(there)
-            if not chosen:
-                _refuse_objects(path, archive, there)
+            others = tuple(name for name in there if name not in chosen)
+            remarks = _pickled_remarks(path, archive, others)
+            if remarks and not chosen:
+                raise LogError(f"{path}: {remarks[0]}")
             headers = {name: _member_header(path, archive, name, field) for name, field in chosen.items()}
             check_size(path, {name: shape for name, (shape, _) in headers.items()})
             total = sum(math.prod(shape) for shape, _ in headers.values())
             arrays = {
                 name: as_numbers(_read_member(archive, name), field, total) for name, field in chosen.items()
             }
-            return RawArrays(arrays, tuple(name for name in there if name not in chosen))
+            return RawArrays(arrays, others, remarks=remarks)
     except ARCHIVE_ERRORS as error:
         if path.stat().st_size == 0:
             raise LogError(f"{path}: the file is empty, expected an NPZ archive") from None
@@ -95,8 +89,7 @@ def read_npy(path: Path, choose: ColumnChooser) -> RawArrays:
         except ValueError as error:
             raise LogError(f"{path}: no NumPy array: {error}") from None
         if dtype.hasobject:
-            command = CONVERSION.format(name=path.name, member="")
-            raise LogError(PICKLE_MESSAGE.format(path=path, name="log", command=command))
+            raise LogError(f"{path}: log: found the type object, {unpickled(path)}")
         if dtype.names is None:
             raise LogError(
                 f"{path}: found one array {shape} without names, expected records, or an NPZ archive: "
@@ -147,8 +140,8 @@ def _member_header(path: Path, archive: zipfile.ZipFile, name: str, field: str) 
     return shape, dtype
 
 
-def _refuse_objects(path: Path, archive: zipfile.ZipFile, names: list[str]) -> None:
-    """Raise LogError if an array holds a pickled dict, as `numpy.savez` writes one."""
+def _pickled_remarks(path: Path, archive: zipfile.ZipFile, names: Sequence[str]) -> tuple[str, ...]:
+    """A remark about the first array that holds pickled objects, as `numpy.savez` writes a dict."""
     for name in names[:10]:
         with archive.open(f"{name}.npy") as file:
             try:
@@ -156,8 +149,8 @@ def _refuse_objects(path: Path, archive: zipfile.ZipFile, names: list[str]) -> N
             except ValueError:
                 continue
         if dtype.hasobject:
-            command = CONVERSION.format(name=path.name, member=f"['{name}']")
-            raise LogError(PICKLE_MESSAGE.format(path=path, name=name, command=command))
+            return (f"{name}: found the type object, {unpickled(path)}",)
+    return ()
 
 
 def _read_member(archive: zipfile.ZipFile, name: str) -> Any:

@@ -162,8 +162,8 @@ def read_fields(path: Path, names: ColumnMap) -> tuple[dict[str, Floats], list[s
         names: The map of columns.
 
     Returns:
-        Arrays by field in SI units, (N,) or (N, J), a constant () or (J,); names of the joints, or
-        None if not found; remarks about what was assumed.
+        Arrays by field in SI units, (N,) or (N, J), a constant () or (J,), with NaN for what is
+        missing; names of the joints, or None if not found; remarks about what was assumed.
     """
     fields: dict[str, Floats] = {}
     remarks: list[str] = []
@@ -286,20 +286,30 @@ def _stack_columns(
     scale: float | list[float] | None,
     of_joints: bool = False,
 ) -> Floats:
-    """Stack columns to one array in SI units, without trailing rows that hold no number."""
+    """Stack columns to one array in SI units."""
     parts = [raw.arrays[name] * _unit_factor(path, name, raw.units.get(name), scale) for name in columns]
     values = np.stack(parts, 1) if len(columns) > 1 or of_joints else parts[0]
     if scale is not None:
         values = values * np.asarray(scale)
-    if values.ndim == 0:
-        return values
-    there = ~np.isnan(values)
-    whole = np.flatnonzero(there if there.ndim == 1 else there.all(axis=1))
-    if len(values) and not whole.size:
+    if values.ndim and len(values) and not count_whole_rows(values):
         raise LogError(
             f"{path}: {field}: no row holds a number for each joint, {len(values)} rows are not finite"
         )
-    return values[: whole[-1] + 1 if whole.size else 0]
+    return values
+
+
+def count_whole_rows(values: Floats) -> int:
+    """Count the rows up to the last one without a missing value.
+
+    Args:
+        values: (N,) or (N, J) values.
+
+    Returns:
+        The number of rows; 0 if a value is missing in each.
+    """
+    missing = np.isnan(values)
+    whole = np.flatnonzero(~(missing if missing.ndim == 1 else missing.any(axis=1)))
+    return int(whole[-1]) + 1 if whole.size else 0
 
 
 def _unit_factor(path: Path, column: str, unit: str | None, scale: Any) -> float:

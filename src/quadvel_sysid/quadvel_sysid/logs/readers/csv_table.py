@@ -100,6 +100,20 @@ def _is_number(cell: str) -> bool:
     )
 
 
+def _is_value(cell: str) -> bool:
+    """Whether a cell holds a number, truth value, date or list of numbers, or marks a missing value."""
+    try:
+        return _is_number(cell) or _Dialect(None, ()).number(cell, time=True) is not None
+    except (ValueError, RecursionError):
+        return False
+
+
+def _is_row(cells: Sequence[str]) -> bool:
+    """Whether most of the cells that are not empty hold values, so that they are no head."""
+    filled = [cell for cell in cells if cell]
+    return 2 * sum(map(_is_value, filled)) > len(filled)
+
+
 def read(path: Path, choose: ColumnChooser) -> RawArrays:
     """Read the selected columns of a text table.
 
@@ -124,7 +138,7 @@ def read(path: Path, choose: ColumnChooser) -> RawArrays:
 def _read(path: Path, file: IO[str], choose: ColumnChooser) -> RawArrays:
     """Read the table from an open file."""
     lines = _lines(path, file)
-    form, stated, begin = _read_head(path, lines)
+    form, stated, begin = _read_head(path, lines, choose)
     chosen = _chosen(path, form.columns, choose)
     first = list(_block(chain(begin, lines), SAMPLE_LINES))
     below = _units_below(form, chosen, first)
@@ -164,10 +178,13 @@ def _lines(path: Path, file: IO[str]) -> Iterator[Line]:
             yield number, line
 
 
-def _read_head(path: Path, lines: Iterator[Line]) -> tuple[_Dialect, dict[str, str], list[Line]]:
+def _read_head(
+    path: Path, lines: Iterator[Line], choose: ColumnChooser
+) -> tuple[_Dialect, dict[str, str], list[Line]]:
     """Read the head: the dialect, the units it states, and the first row if that was read.
 
-    `numpy.savetxt` writes the head as a comment.
+    `numpy.savetxt` writes the head as a comment. pandas numbers columns without a name: a line of
+    numbers counts as a head if it names the time, or if a map names one of the numbers.
     """
     comment, begin = "", (0, "")
     for begin in lines:
@@ -177,9 +194,11 @@ def _read_head(path: Path, lines: Iterator[Line]) -> tuple[_Dialect, dict[str, s
     head = begin[1]
     form = _Dialect(_separator(head), ())
     cells, rows = form.cells(head), []
-    if all(map(_is_number, cells)):
+    named_fields = choose(cells)
+    is_named = any(field in TIME_FIELDS for field in named_fields.values())
+    if _is_row(cells) and not is_named and not any(map(_is_number, named_fields)):
         cells, rows = form.cells(comment) if comment else [], [begin]
-        if len(cells) != len(form.cells(head)) or all(map(_is_number, cells)):
+        if len(cells) != len(form.cells(head)) or _is_row(cells):
             found = f"found the numbers {head.strip()[:40]}"
             raise LogError(f"{path}: line {begin[0]}: {found}, but no head above them; {EXPECTED_HEAD}")
     named = [units.split_unit(cell) for cell in cells]
@@ -190,7 +209,7 @@ def _separator(head: str) -> str | None:
     """Guess the separator of a line; None for white space."""
     bare = re.sub(r'"[^"]*"', "", head)
     for one in SEPARATORS[1:]:
-        if one in bare and all(map(_is_number, _Dialect(one, ()).cells(head))):
+        if one in bare and _is_row(_Dialect(one, ()).cells(head)):
             return one
     most = max(SEPARATORS, key=bare.count)
     return most if most in bare or len(head.split()) == 1 else None

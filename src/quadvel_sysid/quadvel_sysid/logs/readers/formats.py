@@ -17,25 +17,33 @@ from .raw import ColumnChooser, RawArrays, as_numbers, check_size, check_type
 MAX_GROUPS = 1000
 """Structs or groups of a file that are searched for a log."""
 
-_TORCH = (
-    "python -c \"import numpy, torch; numpy.savez('log.npz', "
-    "**{k: numpy.asarray(v) for k, v in torch.load('{name}', weights_only=True).items()})\""
+_FLATTEN = (
+    "n = lambda v: isinstance(v, dict) or isinstance(v, list) and any(isinstance(r, dict) for r in v[:1]); "
+    "f = lambda v: f({k: [r.get(k, numpy.nan) for r in v] for k in v[0]}) if isinstance(v, (list, tuple)) else "
+    "{**max((f(w) for w in dict(v).values() if n(w)), key=len, default={}), "
+    "**{str(k): w for k, w in dict(v).items() if not n(w)}}"
 )
-_PICKLE = "python -c \"import numpy, pickle; numpy.savez('log.npz', **pickle.load(open('{name}', 'rb')))\""
-_JOBLIB = "python -c \"import joblib, numpy; numpy.savez('log.npz', **joblib.load('{name}'))\""
-_PANDAS = "python -c \"import pandas; pandas.{reader}.to_csv('log.csv', index=False)\""
-_UNPICKLED = "it is a pickle, which may run programs and is not read; if you trust it: {command}"
-_CONVERTED = "nothing here reads it; to convert it: {command}"
-CONVERSIONS: Mapping[str, tuple[str, str]] = {
-    **dict.fromkeys((".pt", ".pth"), (_UNPICKLED, _TORCH)),
-    **dict.fromkeys((".pkl", ".pickle"), (_UNPICKLED, _PICKLE)),
-    ".joblib": (_UNPICKLED, _JOBLIB),
-    **dict.fromkeys((".xlsx", ".xls", ".ods"), (_CONVERTED, _PANDAS.replace("{reader}", "read_excel('{name}')"))),
-    **dict.fromkeys((".feather", ".arrow"), (_CONVERTED, _PANDAS.replace("{reader}", "read_feather('{name}')"))),
-    **dict.fromkeys((".jsonl", ".ndjson"), (_CONVERTED, _PANDAS.replace("{reader}", "read_json('{name}', lines=True)"))),
-    **dict.fromkeys((".zip", ".zst", ".xz", ".bz2"), (_CONVERTED, "unpack it")),
+"""Program that takes the arrays of the largest dict in nested dicts and lists of dicts, and those above it."""
+_LOADED = {
+    **dict.fromkeys((".pt", ".pth"), ("torch", "torch.load('{name}', map_location='cpu', weights_only=False)")),
+    **dict.fromkeys((".pkl", ".pickle"), ("pickle", "pickle.load(open('{name}', 'rb'))")),
+    ".joblib": ("joblib", "joblib.load('{name}')"),
+    ".npy": ("numpy", "numpy.load('{name}', allow_pickle=True).tolist()"),
+    ".npz": (
+        "numpy",
+        "{k: v.tolist() if v.dtype == object else v for k, v in numpy.load('{name}', allow_pickle=True).items()}",
+    ),
 }  # fmt: skip
-"""By suffix: why a file is not read, and a command that converts it."""
+"""By suffix: the module that unpickles a file, and the expression that does it."""
+_PANDAS = "python -c \"import pandas; pandas.{reader}.to_csv('log.csv', index=False)\""
+CONVERSIONS: Mapping[str, str] = {
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), _PANDAS.replace("{reader}", "read_excel('{name}')")),
+    **dict.fromkeys((".feather", ".arrow"), _PANDAS.replace("{reader}", "read_feather('{name}')")),
+    **dict.fromkeys((".jsonl", ".ndjson"), _PANDAS.replace("{reader}", "read_json('{name}', lines=True)")),
+    **dict.fromkeys((".zip", ".xz", ".bz2"), "unpack it"),
+    **dict.fromkeys((".zst", ".zstd"), "zstd -d '{name}' -o '{stem}'"),
+}  # fmt: skip
+"""By suffix: a command that converts a file that is not read."""
 
 
 def unreadable_reason(path: Path, known: Collection[str]) -> str:
@@ -48,12 +56,36 @@ def unreadable_reason(path: Path, known: Collection[str]) -> str:
     Returns:
         The sentence, with a command that converts the file if there is one.
     """
-    reason, command = CONVERSIONS.get(path.suffix.lower(), ("", ""))
-    command = command.replace("{name}", path.name)
-    if reason:
-        return f"{path}: the suffix is '{path.suffix}': {reason.format(command=command)}"
+    suffix = path.suffix.lower()
+    if suffix in _LOADED:
+        return f"{path}: the suffix is '{path.suffix}': it is {unpickled(path)}"
+    if suffix in CONVERSIONS:
+        command = CONVERSIONS[suffix].replace("{name}", path.name).replace("{stem}", path.stem)
+        return f"{path}: the suffix is '{path.suffix}': nothing here reads it; to convert it: {command}"
     listed = ", ".join((".mcap", ".db3", ".bag", *known))
     return f"{path}: the suffix is '{path.suffix}', expected {listed}, or a folder of rosbag2 or LeRobot"
+
+
+def unpickled(path: Path) -> str:
+    """Explain why a pickle is not read, with a command that converts it.
+
+    Args:
+        path: The file, with a suffix of PyTorch, pickle, joblib or NumPy.
+
+    Returns:
+        The end of a sentence. The command writes the archive `log.npz`, or `log_arrays.npz` if the
+        file itself has that name.
+    """
+    module, load = _LOADED[path.suffix.lower()]
+    archive = "log_arrays.npz" if path.name == "log.npz" else "log.npz"
+    program = (
+        f"import {', '.join(sorted({'numpy', module}))}; {_FLATTEN}; numpy.savez('{archive}', **f({load}))"
+    )
+    command = f'python -c "{program}"'.replace("{name}", path.name)
+    return (
+        "a pickle, which may run programs and is not read; "
+        f"if you trust it, and it holds dicts of arrays or a list of dicts: {command}"
+    )
 
 
 def import_reader(path: Path, name: str) -> Any:

@@ -15,7 +15,7 @@ from quadvel_description.arrays import Bools, Floats
 from quadvel_description.quadruped import JOINT_NAMES
 
 from ..log import Log, LogError, joint_name
-from .columns import ColumnMap, read_fields
+from .columns import ColumnMap, count_whole_rows, read_fields
 from .raw import check_size
 
 STATE_FIELDS = ("q", "dq", "tau", "temperature")
@@ -39,13 +39,17 @@ def read_table(path: Path, names: ColumnMap) -> Log:
     """
     fields, joints, remarks = read_fields(path, names)
     check_size(path, {name: np.shape(values) for name, values in fields.items()})
-    for name in ("t", "q"):
+    pickled = next((one for one in remarks if "a pickle" in one), "")
+    for name in ("t", "q", "q_des") if pickled and "q_des_cmd" not in fields else ("t", "q"):
         if name not in fields:
             there = ", ".join(fields) or "none"
+            if pickled:
+                raise LogError(f"{path}: {name}: the field is missing, found {there}; {pickled}")
             more = next((one for one in remarks if "not used" in one), "").partition("such fields: ")[2]
             more = f"; of {more}, --columns MAPFILE says which is what" if more else ""
             raise LogError(f"{path}: {name}: the field is missing, found {there}{more}")
-    return _log(path, fields, joints, remarks)
+    remarks = [one for one in remarks if one != pickled]
+    return _log(path, _cut_incomplete_rows(path, fields, remarks), joints, remarks)
 
 
 def drop_repeated_times(
@@ -74,6 +78,32 @@ def drop_repeated_times(
         )
         return time[fresh], {name: value[fresh] for name, value in values.items()}
     return time, dict(values)
+
+
+def _cut_incomplete_rows(path: Path, fields: Mapping[str, Floats], remarks: list[str]) -> dict[str, Floats]:
+    """Cut trailing rows in which a field misses a value, alike for all fields on the same times.
+
+    Raises LogError if a field would cut half of the rows or more.
+    """
+    cut = {
+        name: values[: count_whole_rows(values)] if values.ndim else values for name, values in fields.items()
+    }
+    with_states = () if "q_des_cmd" in fields else ("q_des", *COMMAND_FIELDS)
+    for base in (("t", *STATE_FIELDS, "voltage", "valid", *with_states), ("t_cmd", "q_des_cmd")):
+        shape = fields[base[0]].shape[:1] if base[0] in fields else ()
+        alike = [name for name in base if shape and name in fields and fields[name].shape[:1] == shape]
+        rows = {name: len(cut[name]) for name in alike}
+        whole, most = min(rows.values(), default=0), max(rows.values(), default=0)
+        if whole == most:
+            continue
+        short = min(rows, key=lambda name: rows[name])
+        if 2 * whole <= most:
+            raise LogError(
+                f"{path}: {short}: no value from row {whole} on, expected one in each of {most} rows"
+            )
+        remarks.append(f"{short}: no value in the last {most - whole} of {most} rows, which are left out")
+        cut |= {name: cut[name][:whole] for name in rows}
+    return cut
 
 
 def _log(path: Path, fields: dict[str, Any], names: list[str] | None, remarks: list[str]) -> Log:
