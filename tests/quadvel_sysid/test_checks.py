@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_sysid.logs.check_log import CheckedLog, check_log
+from quadvel_sysid.logs.check_log import CheckedLog, check_log, check_logs
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
 from tests.helpers.robots import ALIENGO
@@ -341,3 +341,26 @@ def test_commanded_speed_is_not_a_clock_offset(tmp_path):
     tau = log["tau"] + kd * (dq_des - log["dq"]) + KD * log["dq"]
     found = check_log(read_log(npz(tmp_path / "log.npz", dq_des=dq_des, tau=tau, kd=kd)))
     assert not [one.text for one in found.findings if one.kind == "refusal"]
+
+
+def test_joint_that_turns_far_without_a_position_command_does_not_stop_the_others() -> None:
+    """The command of the second joint is 0 while a torque turns it by 40 rad."""
+    given, second = fields(), np.arange(12) == 1
+    turned = 10.0 * given["t"] + np.sin(3.0 * given["t"])
+    far = np.where(second, turned[:, None], given["q"])
+    fast = np.where(second, np.gradient(turned, given["t"])[:, None], given["dq"])
+    loose = log(q=far, dq=fast, q_des=np.where(second, 0.0, given["q_des"]), kp=None, kd=None)
+    (checked,), _ = check_logs([loose])
+    assert checked.log.joints == tuple(name for name in JOINT_NAMES if name != "FR_thigh_joint")
+    named = [(one.kind, one.field) for one in checked.findings if one.joints == ("FR_thigh_joint",)]
+    assert named == [("warning", "q_des"), ("note", "valid")]
+    assert len(texts(checked, "warning")) == 1
+
+
+def test_logs_that_leave_no_joint_both_fitted_and_reported_are_refused() -> None:
+    first, second = (np.arange(12) == j for j in (0, 1))
+    logs = [log(valid=np.tile(one, (2000, 1))) for one in (first, second)]
+    with pytest.raises(LogError, match="valid: no joint has rows both in the logs to fit"):
+        check_logs(logs[:1], logs[1:])
+    (fitted, other), _ = check_logs(logs)
+    assert fitted.log.joints == other.log.joints == JOINT_NAMES[:2]

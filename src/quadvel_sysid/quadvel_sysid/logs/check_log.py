@@ -6,11 +6,14 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import attrs
+import numpy as np
+
+from quadvel_description.arrays import Bools
 
 from .checks import response
 from .checks.pd_control import explainable_rows
 from .checks.table import MOTION_CHECKS, RESPONSE_CHECKS, ROW_CHECKS, Check
-from .findings import Finding
+from .findings import Finding, format_names
 from .log import Log, LogError
 
 
@@ -61,6 +64,7 @@ def check_log(log: Log, gains: tuple[float, float] | None = None) -> CheckedLog:
     valid, why = explainable_rows(answer)
     findings += why
     log = attrs.evolve(log, valid=valid)
+    findings += _joints_without_rows(log)
     found = None if _has_refusal(findings) else response.measure_response(log)
     for check in RESPONSE_CHECKS if found else ():
         log = _run_check(check, findings, log, found)
@@ -75,7 +79,10 @@ def check_logs(
     gains: tuple[float, float] | None = None,
     on_checked: Callable[[CheckedLog], None] = lambda checked: None,
 ) -> tuple[list[CheckedLog], list[CheckedLog]]:
-    """Check the logs of one identification, and reduce them to the joints of the first one.
+    """Check the logs of one identification, and reduce them to the joints that they can identify.
+
+    These are the joints of the first log that have valid rows in the logs to fit, and in those to
+    report on.
 
     Args:
         train: Logs to fit, at least one.
@@ -87,7 +94,8 @@ def check_logs(
         The checked logs to fit, and those to report on.
 
     Raises:
-        LogError: A log is refused, or its joints or fields differ from the first one's.
+        LogError: A log is refused, its joints or fields differ from the first one's, or no joint is
+            left.
     """
 
     def passed(log: Log) -> CheckedLog:
@@ -96,7 +104,36 @@ def check_logs(
         checked.raise_refusal()
         return checked
 
-    return [passed(log) for log in train], [passed(log) for log in heldout]
+    parts = [passed(log) for log in train], [passed(log) for log in heldout]
+    used = np.ones(len(train[0].joints), bool)
+    for part in parts:
+        if part:
+            used &= np.any([one.log.valid.any(axis=0) for one in part], axis=0)
+    if not used.any():
+        raise LogError(
+            f"{train[0].name}: valid: no joint has rows both in the logs to fit and in those to report on, "
+            "expected one or more"
+        )
+    train_parts, heldout_parts = ([_select_joints(one, used) for one in part] for part in parts)
+    return train_parts, heldout_parts
+
+
+def _select_joints(checked: CheckedLog, used: Bools) -> CheckedLog:
+    """The checked log with the marked joints (J,) alone."""
+    return attrs.evolve(checked, log=checked.log.select_joints(checked.log.joints_where(used)))
+
+
+def _joints_without_rows(log: Log) -> list[Finding]:
+    """A note on the joints without a valid row, if other joints have some; the cause is another finding."""
+    lost: Bools = np.asarray(~log.valid.any(axis=0))
+    if lost.all() or not lost.any():
+        return []
+    joints = log.joints_where(lost)
+    text = (
+        f"valid: no row of {format_names(joints)} is left in this log; joints without rows are left out "
+        "of the model"
+    )
+    return [Finding("note", "valid", joints, text)]
 
 
 def _with_joints_of_first(log: Log, logs: Sequence[Log]) -> Log:

@@ -219,7 +219,7 @@ def speed_units(log: Log) -> Iterator[Finding]:
 
 
 def angle_units(log: Log) -> Iterator[Finding]:
-    """Angles that are too large for a joint, in q, in the commands or in both.
+    """Angles in valid rows that are too large for a joint, in q, in the commands or in both.
 
     Args:
         log: The log to check.
@@ -228,16 +228,19 @@ def angle_units(log: Log) -> Iterator[Finding]:
         A refusal or a warning.
     """
     row = sample_rows(log)
+    valid = log.valid[row]
+    if not valid.any():
+        return
     q = np.asarray(log.q[row], dtype=float)
     q_des = np.asarray(log.q_des[log.command_rows(log.t[row])], dtype=float)
-    size, asked = (float(np.sqrt(np.mean(x**2))) for x in (q, q_des))
+    size, asked = (float(np.sqrt(np.mean(x**2, where=valid))) for x in (q, q_des))
     for field, other, large, small in (("q_des", "q", asked, size), ("q", "q_des", size, asked)):
         share = large / small if small > 0.0 else np.inf
         if 25.0 < share < 130.0:
             text = f"{field}: about {share:.0f} times as large as {other}: degrees? expected rad in both"
             yield Finding("refusal", field, (), text)
             return
-    most = np.percentile(np.abs(q), 95, axis=0)
+    most = np.percentile(np.where(valid, np.abs(q), 0.0), 95, axis=0)
     if (joints := log.joints_where(most > MAX_ANGLE_RAD)) and set(log.joints) <= set(JOINT_NAMES):
         text = f"q: up to {most.max():.0f} on {format_names(joints)}: degrees? expected rad"
         yield Finding("refusal", "q", joints, text)

@@ -25,6 +25,7 @@ from ..findings import Finding
 from ..log import Log
 from .response import (
     EXPLAINED_ERROR_SHARE,
+    MAX_DRIVE_DELAY_S,
     MAX_LAG_S,
     PREFERRED_ERROR_RATIO,
     TIME_ROUNDING_S,
@@ -37,8 +38,6 @@ MAX_CLOCK_LAG_S = 10.0
 """s; largest lag to either side, at most half of the log."""
 MAX_ROWS = 30_000
 """Rows used, from the middle of a long log: one minute at `LAG_STEP_S`."""
-MAX_DRIVE_DELAY_S = 0.045
-"""s; longest delay of a drive: the model has 26 ms at most, and rows at 50 Hz add up to 20 ms."""
 MAX_SPEED_LEAD_S = 0.2
 """s; largest kd / kp of a drive that feeds the commanded speed forward."""
 MIN_STANDARD_ERRORS = 4.0

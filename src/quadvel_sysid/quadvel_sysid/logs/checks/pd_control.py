@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from quadvel_description.arrays import Bools, Floats, Indices
 
 from ..findings import Finding, format_names
-from ..log import Log
+from ..log import TIME_TOLERANCE_S, Log
 from .response import motion_regressors
 
 BIN_S = 0.02
@@ -40,6 +40,11 @@ MAX_FIT_ROWS, MIN_FIT_ROWS = 4000, 200
 """Rows that a PD law is fitted to: at least `MIN_FIT_ROWS`, at most `MAX_FIT_ROWS`."""
 MAX_ERROR_RATIO = 9.0
 """A stretch with at most this many times the mean squared error elsewhere was under PD control."""
+
+MAX_OFFSET_ERROR_RATIO = 0.5
+"""A torque has a constant offset if a PD law with one leaves at most this share of the squared error
+of a PD law without.
+"""
 
 
 def explainable_rows(log: Log) -> tuple[Bools, list[Finding]]:
@@ -159,6 +164,7 @@ def true_runs(rows: NDArray[Any], t: Floats, least: float = 0.0) -> list[tuple[f
 
 def _low_gain_rows(log: Log) -> Bools:
     """Rows (N,) in windows whose gain from position error to torque is far below its usual value."""
+    log = _without_offsets(log)
     steps = np.diff(((log.t - log.t[0]) / BIN_S).astype(np.intp), prepend=0)
     # A gap shifts the bins by a whole window, so that no window bridges it.
     bins = np.cumsum(np.minimum(steps, WINDOW_BINS))
@@ -193,6 +199,21 @@ def _low_gain_rows(log: Log) -> Bools:
     return _with_margin(lost, log.t)
 
 
+def _without_offsets(log: Log) -> Log:
+    """The log without the constant offset of each joint's torque, which no position error explains."""
+    assert log.tau is not None
+    offsets, rows = np.zeros(len(log.joints)), np.arange(len(log.t))
+    rows = rows[:: max(1, len(rows) // MAX_LAG_ROWS)]
+    for j, (use, e, d, tau) in enumerate(_joint_signals(log, rows, 0.0)):
+        # tau = kp e + kd d + c tanh(d / w) + offset, with the last regressor and without it
+        law = np.column_stack([e, use[:, None] * motion_regressors(d)])
+        without, found = (np.linalg.lstsq(x, tau, rcond=1e-9)[0] for x in (law[:, :-1], law))
+        error, other = np.sum((tau - law @ found) ** 2), np.sum((tau - law[:, :-1] @ without) ** 2)
+        if error < MAX_OFFSET_ERROR_RATIO * other:
+            offsets[j] = found[-1]
+    return attrs.evolve(log, tau=log.tau - offsets) if offsets.any() else log
+
+
 def _differential_gain(log: Log, rows: Bools, lag: float) -> float:
     """Gain from changes of the position error to changes of the torque within `rows`.
 
@@ -222,22 +243,31 @@ def _relative_error(log: Log, lost: Bools) -> Floats | None:
     fitted = fitted[:: max(1, len(fitted) // MAX_FIT_ROWS)]
     if len(fitted) < MIN_FIT_ROWS:
         return None
+    lags = [(lag, state_lag) for lag in LAGS_S for state_lag in sorted({0.0, float(lag)})]
     left = [
-        min((_squared_error(log, j, fitted, lag) for lag in LAGS_S), key=lambda x: float(x[fitted].mean()))
+        min((_squared_error(log, j, fitted, *both) for both in lags), key=lambda x: float(x[fitted].mean()))
         for j in range(len(log.joints))
     ]
     return np.asarray(np.mean([one / (one[fitted].mean() + 1e-12) for one in left], axis=0))
 
 
-def _squared_error(log: Log, j: int, fitted: Indices, lag: float) -> Floats:
-    """Squared error (N,) of one joint's PD law at a lag; 0 in invalid rows."""
+def _squared_error(log: Log, j: int, fitted: Indices, lag: float, state_lag: float) -> Floats:
+    """Squared error (N,) of one joint's PD law, commands and states delayed by s; 0 in invalid rows."""
     assert log.tau is not None
-    row = np.maximum(np.searchsorted(log.t, log.t - lag, side="right") - 1, 0)
-    command = log.command_rows(log.t[row])
+    row = np.maximum(np.searchsorted(log.t, log.t - state_lag + TIME_TOLERANCE_S, side="right") - 1, 0)
+    command = log.command_rows(log.t - lag)
     kp, kd = (1.0 if gain is None else np.asarray(gain)[command, j] for gain in (log.kp, log.kd))
     q, dq = (np.asarray(x[row, j], dtype=float) for x in (log.q, log.dq))
-    speed = [] if log.dq_des is None else [log.dq_des[command, j]]
-    signals = (kp * (log.q_des[command, j] - q), kd * -dq, q - q.mean(), *motion_regressors(dq).T, *speed)
+    # A drive may feed the slope of q_des forward although dq_des is not logged.
+    q_des = np.asarray(log.q_des[:, j], dtype=float)
+    speed = np.gradient(q_des, log.t_cmd) if log.dq_des is None else log.dq_des[:, j]
+    signals = (
+        kp * (q_des[command] - q),
+        kd * -dq,
+        q - q.mean(),
+        *motion_regressors(dq).T,
+        speed[command],
+    )
     law, tau = np.stack(signals, axis=1), np.asarray(log.tau[:, j], dtype=float)
     use = fitted[log.valid[fitted, j]]
     weights = np.linalg.lstsq(law[use], tau[use], rcond=1e-9)[0]

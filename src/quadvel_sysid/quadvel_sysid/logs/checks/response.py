@@ -24,6 +24,8 @@ MAX_ROWS = 4000
 """Rows of a log that are used, spread over its length."""
 LAG_STEP_S, MAX_LAG_S = 0.002, 0.1
 """s; largest lag to either side; lags are `LAG_STEP_S` apart, or one row of the log if that is more."""
+MAX_DRIVE_DELAY_S = 0.045
+"""s; longest delay of a drive: the model has 26 ms at most, and rows at 50 Hz add up to 20 ms."""
 TIME_ROUNDING_S = 1e-9
 """s; a command this much later than an instant is still in force at it (round-off of summed times)."""
 FRICTION_SPEED_RAD_S = 0.05
@@ -65,10 +67,10 @@ class Response:
             leave.
         command_correlation: (J,) partial correlation with the own command at the best lag.
         angle_correlation: (J,) partial correlation with the own angle, given the command.
-        gain: (J,) gain of the position error, N m/rad.
+        gain: (J,) gain of the position error, N m/rad, at the lag of `answered_share`.
         command_gain: (J,) gain of the command given the angle, N m/rad; springs do not change it.
         answered_share: (J,) share of the torque left by speed and friction that the position
-            error explains.
+            error explains, at the best lag that a drive can have.
     """
 
     log: Log
@@ -104,15 +106,16 @@ def measure_response(log: Log) -> Response | None:
     if log.tau is None or len(row) < 50:
         return None
     lags = step * np.arange(-int(MAX_LAG_S / step + 0.5), int(MAX_LAG_S / step + 0.5) + 1)
+    of_a_drive = (lags > -0.5 * step) & (lags < MAX_DRIVE_DELAY_S + 0.5 * step)
     at = [log.command_rows(log.t[row] - lag + TIME_ROUNDING_S) for lag in lags]
     left, found = np.empty((len(lags), len(log.joints))), np.empty((5, len(log.joints)))
     for j in range(len(log.joints)):
-        left[:, j], found[:, j] = _of_joint(log, row, at, j)
+        left[:, j], found[:, j] = _of_joint(log, row, at, of_a_drive, j)
     return Response(log, row, lags, left, *found)
 
 
 def _of_joint(
-    log: Log, row: Indices, at: Sequence[Indices], j: int
+    log: Log, row: Indices, at: Sequence[Indices], of_a_drive: Bools, j: int
 ) -> tuple[Floats, tuple[float, float, float, float, float]]:
     """Error share (L,) of joint `j`, and its five scalars of `Response`.
 
@@ -120,6 +123,7 @@ def _of_joint(
         log: The log, with the feed-forward torque subtracted.
         row: (R,) state rows.
         at: Command rows (R,) of each lag.
+        of_a_drive: (L,) lags that a drive can have.
         j: Index of the joint.
     """
     assert log.tau is not None
@@ -142,13 +146,32 @@ def _of_joint(
     )
     other = _residual(p, c[:, k])
     angle = float(other @ _residual(y, c[:, k]) / (np.linalg.norm(other) * np.linalg.norm(y) + 1e-12))
-    # Gains by regression: of the position error (q_des - q), and of q_des given q.
-    error = c[:, k] - p
-    gain = float(error @ y / (error @ error + 1e-12))
     command_gain = float(torque_rest @ of_c[:, k] / size[k] ** 2)
-    answer = float((error @ y) ** 2 / ((error @ error) * (y @ y) + 1e-12))
+    gain, answer = _answer_to_error(y, c[:, of_a_drive] - p[:, None])
     misses = (torque_rest[:, None] - of_c * (torque_rest @ of_c / size**2)) ** 2 / variance
-    return misses.mean(axis=0), (float(r[k]), angle, gain, command_gain, answer if gain > 0.0 else 0.0)
+    return misses.mean(axis=0), (float(r[k]), angle, gain, command_gain, answer)
+
+
+def _answer_to_error(y: Floats, error: Floats) -> tuple[float, float]:
+    """Gain (N m/rad) of the position error, and the share of `y` it explains, at its best lag.
+
+    The lag of the best partial correlation does not serve here. Given the angle, a command of one
+    frequency explains nothing at any lag, and on a stiff joint the best lag is that of the commanded
+    speed. No lag is preferred unless another explains clearly more: one frequency does not show it.
+
+    Args:
+        y: (R,) torque, N m, with speed, friction and offset projected out.
+        error: (R, K) position error, rad, at no lag and at K - 1 lags, with the same projected out.
+    """
+    # At each lag: y = kp e + rest,  kp = (e . y) / |e|^2,  share = (e . y)^2 / (|e|^2 |y|^2).
+    product, square = error.T @ y, np.sum(error**2, axis=0)
+    share = product**2 / (square * (y @ y) + 1e-12)
+    signed = np.sign(product) * share
+    best = int(np.argmax(signed))
+    if 1.0 - signed[best] > PREFERRED_ERROR_RATIO * (1.0 - signed[0]):
+        best = 0
+    gain = float(product[best] / (square[best] + 1e-12))
+    return gain, float(share[best]) if gain > 0.0 else 0.0
 
 
 def motion_regressors(dq: Floats) -> Floats:

@@ -131,7 +131,7 @@ ROW_CHECKS = (
         "lag from command to torque (without torque, to the acceleration) with the smallest error, s; this "
         "error over that of the best lag a drive can have; certainty, in standard errors over pieces of "
         f"{clocks.PIECE_S:g} s",
-        f"0 to {clocks.MAX_DRIVE_DELAY_S:g} s (without torque -{clocks.MAX_MOTION_LAG_S:g} to "
+        f"0 to {response.MAX_DRIVE_DELAY_S:g} s (without torque -{clocks.MAX_MOTION_LAG_S:g} to "
         f"{clocks.MAX_MOTION_LAG_S:g} s); {response.PREFERRED_ERROR_RATIO:g}; "
         f"{clocks.MIN_STANDARD_ERRORS:g}",
         "refusal",
@@ -161,7 +161,8 @@ RESPONSE_CHECKS = (
     ),
     Check(
         response.unresponsive,
-        "share of the torque left by speed and friction that the position error explains",
+        "share of the torque left by speed and friction that the position error explains, at the best lag "
+        "that a drive can have",
         f"{response.MIN_ANSWERED_SHARE:.0%}",
         "warning; on all joints a refusal",
     ),
