@@ -22,13 +22,13 @@ from .run import Run
 
 VELOCITY_SCALE_M_S, HEIGHT_SCALE_M = 0.05, 0.003
 """Contradictions that weigh alike; twice what a healthy walk shows."""
-HEALTHY, DOUBTED = 1.2, 2.0
+HEALTHY, DOUBTED = 1.35, 2.0
 """Contradiction up to which legs agree, and from which the usual conventions are doubted; healthy walks show 0.9."""
 CLEAR_HEIGHT_M = 0.01
 """Unevenness that sliding feet do not cause."""
 EXCHANGE, EXCHANGED_SIDES = "left and right legs exchanged", -0.3
 """Correlation of roll moment and roll below which the sides are exchanged; healthy walks show 0.3 to 0.7."""
-MIN_IMPROVEMENT = 0.4
+MIN_IMPROVEMENT = 0.45
 """Share of the contradiction that an accepted convention may leave."""
 SLOPE_SHARE = 0.1
 """Share of the unevenness that a slope leaves if it explains it."""

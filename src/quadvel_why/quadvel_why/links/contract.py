@@ -25,6 +25,8 @@ BETTER_PAIRING, MIN_ERROR_N2M2 = 4.0, 4.0
 MAX_SPREAD_AT_REST_RAD = 0.02
 EXPLAINED_SHARE = 0.3
 """Share of the mean square torque that a sign may leave."""
+SIMILAR = 2.0
+"""Ratio of the unevenness that two explanations leave, up to which both are named."""
 CERTAIN = 3.0
 """Standard errors by which a coefficient may differ from its estimate."""
 MIN_SHARE_USED = 0.85
@@ -194,8 +196,11 @@ def _convention(signals: Signals, kind: str) -> Measurement | None:
     if best is None or CONVENTIONS[best.name].kind != kind:
         return NOTHING
     offset = best_offset(signals.legs)
-    if offset is not None and offset.size > 0.0 and offset.after < best.legs.unevenness:
+    left = np.inf if offset is None or offset.size == 0.0 else offset.after / best.legs.unevenness
+    if left < 1.0:
         return NOTHING  # a wrong zero explains the heights better
+    experiment = "read the angle of the joint at a known posture, and again after a known turn"
+    alternatives = (("joint_offset", experiment),) if left < SIMILAR else ()
     height = signals.legs.height
     traces = (
         Trace("height of FR minus RR foot below the trunk, m", signals.run.time, height[:, 0] - height[:, 2],
@@ -206,7 +211,7 @@ def _convention(signals: Signals, kind: str) -> Measurement | None:
         f"it is {best.text}"
     )
     off = np.where(signals.legs.planted.any(axis=1), np.abs(height[:, 0] - height[:, 2]), 0.0)
-    return Measurement(1.0, sentence, worst_span(signals.run.time, off), traces)
+    return Measurement(1.0, sentence, worst_span(signals.run.time, off), traces, alternatives)
 
 
 class JointOrder(Cause):
@@ -319,7 +324,10 @@ class JointOffset(Cause):
             f"{run.joints[j]}: {-middle[j]:+.3f} rad between the drive's angle and the recorded one, at rest"
         )
         size = max(float(abs(middle[j]) - doubt[j]), 0.0)
-        return Measurement(size, sentence, torque_span(signals, j), (joint_trace(signals, j),))
+        # At rest a constant torque error may have any of these causes.
+        experiment = "move the joint alone, hanging, over its range: only an offset leaves a constant error"
+        others = (("weak_drive", experiment), ("joint_scale", experiment))
+        return Measurement(size, sentence, torque_span(signals, j), (joint_trace(signals, j),), others)
 
 
 class Gains(Cause):
