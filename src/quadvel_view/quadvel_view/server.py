@@ -101,7 +101,7 @@ class PageServer:
         host: str,
         port: int,
         scene: Path,
-        on_message: Callable[[int, PageMessage], None],
+        on_message: Callable[[int, PageMessage], object],
         on_disconnect: Callable[[int], None],
     ) -> None:
         if not host:
