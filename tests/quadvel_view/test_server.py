@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -177,3 +178,25 @@ def test_a_port_that_is_taken_is_told_in_one_sentence(here: PageServer) -> None:
 def test_an_address_that_does_not_exist_is_told_and_not_waited_for(host: str, port: int) -> None:
     with pytest.raises(AddressError):
         PageServer(host, port, NOWHERE, lambda page, word: None, lambda page: None)
+
+
+def test_floods_from_some_pages_delay_the_stop_of_another_by_few_orders(
+    here: PageServer, heard: list[Any]
+) -> None:
+    ours = f"http://127.0.0.1:{urlsplit(here.url).port}"
+    flood = frame(TEXT, b'{"do":"let_go"}', last=True) * 20_000
+    with ExitStack() as open_pages:
+        pages = [open_pages.enter_context(socket(here, ours)) for _ in range(5)]
+        senders = [Thread(target=page.socket.sendall, args=(flood,)) for page in pages[1:]]
+        for sender in senders:
+            sender.start()
+        until = time.monotonic() + 20.0
+        while len(heard) < 1000 and time.monotonic() < until:
+            time.sleep(0.001)
+        before = len(heard)
+        pages[0].send('{"do":"stop"}')
+        for sender in senders:
+            sender.join()
+        while Stop() not in heard and time.monotonic() < until:
+            time.sleep(0.01)
+    assert heard.index(Stop()) - before < 5_000

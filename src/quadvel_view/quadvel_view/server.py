@@ -15,6 +15,7 @@ import asyncio
 import json
 import logging
 import secrets
+import socket
 from collections.abc import Callable
 from functools import cached_property
 from http import HTTPStatus
@@ -58,6 +59,12 @@ MAX_SOCKETS = 32
 """Largest number of connections, two per page.
 
 Each one delays the messages of the others, including STOP.
+"""
+RECEIVE_BUFFER_BYTES = 8192
+"""Size of the system's buffer for what a connection has received.
+
+The server parses such a buffer in one go. A flood from one page delays STOP of another by the time
+for one buffer.
 """
 # Hide everything of viser's page but the canvas. viser reconnects only while it has the focus,
 # which our page keeps.
@@ -165,6 +172,8 @@ class PageServer:
                 max_size=MAX_MESSAGE_BYTES,
                 logger=LOG,
             ) as server:
+                for listening in server.sockets:  # its connections inherit the size
+                    listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
                 self._port = next(iter(server.sockets)).getsockname()[1]
                 self._ready.set()
                 await self._stop.wait()
