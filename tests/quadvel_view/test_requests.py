@@ -165,3 +165,22 @@ def test_no_request_is_an_error_of_the_server(
     )
     assert status < 500
     assert body or status in (0, 101)
+
+
+@pytest.mark.parametrize(
+    "others",
+    [[b"a=" + b"x" * 60_000], [b"a=" + b"x" * 30_000, b"b=" + b"y" * 30_000]],
+    ids=["in one header", "in two headers"],
+)
+def test_long_cookies_of_other_programs_on_the_host_keep_nobody_out(
+    here: PageServer, others: list[bytes]
+) -> None:
+    cookies = [b"Cookie: " + one for one in others]
+    assert ask(here, HERE, *cookies)[0] == 200
+    assert ask(here, HERE, b"Upgrade: websocket", *HANDSHAKE, OURS, *cookies, path=b"/words")[0] == 101
+
+
+def test_a_request_with_more_headers_than_any_browser_sends_is_not_kept_in_memory(here: PageServer) -> None:
+    headers = [HERE, *(b"X: " + b"x" * 60_000 for _ in range(100))]
+    with pytest.raises(ConnectionError):
+        ask(here, *headers)

@@ -25,6 +25,7 @@ from threading import Event, Thread
 from typing import Any
 from urllib.parse import urlsplit
 
+from websockets import http11
 from websockets.asyncio.client import ClientConnection, unix_connect
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
@@ -60,6 +61,13 @@ MAX_SOCKETS = 32
 
 Each one delays the messages of the others, including STOP.
 """
+MAX_HEADER_LINE_BYTES = 65_536
+"""Largest size of a header line of a request.
+
+A browser sends the cookies of all programs on this host in one line, which may be long.
+"""
+MAX_REQUEST_BYTES = 2 * MAX_HEADER_LINE_BYTES
+"""Largest size of a request with all its headers."""
 RECEIVE_BUFFER_BYTES = 8192
 """Size of the system's buffer for what a connection has received.
 
@@ -87,6 +95,24 @@ def _is_server_error(record: logging.LogRecord) -> bool:
 
 LOG = logging.getLogger("quadvel_view.page")
 LOG.addFilter(_is_server_error)
+
+
+# websockets has no argument for this limit, only an environment variable that it reads on import.
+http11.MAX_LINE_LENGTH = MAX_HEADER_LINE_BYTES
+
+
+class _Connection(ServerConnection):
+    """A connection that ends if its request is longer than MAX_REQUEST_BYTES."""
+
+    _received = 0
+
+    def data_received(self, data: bytes) -> None:
+        """Handle received bytes."""
+        self._received += len(data)
+        if self.request is None and self._received > MAX_REQUEST_BYTES:
+            self.transport.abort()
+        else:
+            super().data_received(data)
 
 
 class PageServer:
@@ -168,6 +194,7 @@ class PageServer:
                 self._port,
                 process_request=self._process_request,
                 select_subprotocol=lambda connection, offered: offered[0] if offered else None,
+                create_connection=_Connection,
                 compression=None,
                 max_size=MAX_MESSAGE_BYTES,
                 logger=LOG,
