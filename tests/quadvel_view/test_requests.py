@@ -70,6 +70,27 @@ def test_a_header_that_makes_no_sense_is_named(here: PageServer, headers: list[b
     assert body.count(b"\n") == 1
 
 
+@pytest.mark.parametrize(
+    "named",
+    [
+        b"Connection",
+        b"Sec-WebSocket-Key",
+        b"Sec-WebSocket-Version",
+        b"Sec-WebSocket-Extensions",
+        b"Sec-WebSocket-Protocol",
+    ],
+)
+def test_bytes_in_a_header_of_the_handshake_are_named_and_no_error_of_the_server(
+    here: PageServer, named: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    others = [header for header in HANDSHAKE if not header.startswith(named + b":")]
+    headers = [HERE, b"Upgrade: websocket", *others, OURS, named + b": \xff"]
+    status, body = ask(here, *headers, path=b"/words")
+    assert status == 400
+    assert body.startswith(named)
+    assert not caplog.records
+
+
 def test_a_path_that_makes_no_sense_is_named(here: PageServer) -> None:
     status, body = ask(here, HERE, path=b"//[bad")
     assert status == 400
