@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from socket import create_connection as raw_socket
 from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
@@ -149,6 +150,23 @@ def test_a_long_message_is_refused_while_it_arrives(
     assert closed.value.rcvd is not None
     assert closed.value.rcvd.code == CloseCode.MESSAGE_TOO_BIG
     assert [word for word in heard if word != "left"] == []
+
+
+def test_a_page_that_does_not_read_delays_the_end_by_little() -> None:
+    server = PageServer("127.0.0.1", 0, NOWHERE, lambda *_: None, lambda _: None)
+    with raw_socket(("127.0.0.1", urlsplit(server.url).port), 10.0) as page:
+        name = f"127.0.0.1:{urlsplit(server.url).port}"
+        page.sendall(
+            f"GET /words HTTP/1.1\r\nHost: {name}\r\nOrigin: http://{name}\r\nUpgrade: websocket\r\n"
+            "Connection: Upgrade\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+            "Sec-WebSocket-Version: 13\r\n\r\n".encode()
+        )
+        until = time.monotonic() + 10.0
+        while not server.is_watched and time.monotonic() < until:
+            time.sleep(0.01)
+        start = time.monotonic()
+        server.close()
+        assert time.monotonic() - start < 5.0
 
 
 def test_elsewhere_only_the_token_lets_in(everywhere: PageServer) -> None:

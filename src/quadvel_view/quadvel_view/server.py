@@ -74,6 +74,8 @@ RECEIVE_BUFFER_BYTES = 8192
 The server parses such a buffer in one go. A flood from one page delays STOP of another by the time
 for one buffer.
 """
+CLOSE_TIMEOUT_S = 1.0
+"""Time for a browser to answer the end of its connection; a slow one does not delay Ctrl-C more."""
 # Hide everything of viser's page but the canvas. viser reconnects only while it has the focus,
 # which our page keeps.
 CANVAS_ONLY = (
@@ -197,6 +199,7 @@ class PageServer:
                 create_connection=_Connection,
                 compression=None,
                 max_size=MAX_MESSAGE_BYTES,
+                close_timeout=CLOSE_TIMEOUT_S,
                 logger=LOG,
             ) as server:
                 for listening in server.sockets:  # its connections inherit the size
