@@ -18,6 +18,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, ConnectionClosedError, InvalidMessage, InvalidStatus
 from websockets.frames import CloseCode
 from websockets.sync.client import connect
+from websockets.sync.server import unix_serve
 
 from quadvel_view.page_protocol import MAX_MESSAGE_BYTES, LetGo, Stop
 from quadvel_view.server import LOG, MAX_FRAGMENTS, MAX_SOCKETS, AddressError, PageServer
@@ -150,6 +151,24 @@ def test_a_long_message_is_refused_while_it_arrives(
     assert closed.value.rcvd is not None
     assert closed.value.rcvd.code == CloseCode.MESSAGE_TOO_BIG
     assert [word for word in heard if word != "left"] == []
+
+
+def test_the_scene_refuses_a_message_in_many_fragments(tmp_path: Path) -> None:
+    with ExitStack() as opened:
+        scene = opened.enter_context(
+            unix_serve(lambda connection: connection.recv(), str(tmp_path / "scene"))
+        )
+        Thread(target=scene.serve_forever, daemon=True).start()
+        opened.callback(scene.shutdown)
+        server = PageServer("127.0.0.1", 0, tmp_path / "scene", lambda *_: None, lambda _: None)
+        opened.callback(server.close)
+        port = urlsplit(server.url).port
+        with connect(f"ws://127.0.0.1:{port}/scene", origin=f"http://127.0.0.1:{port}") as page:
+            page.socket.sendall(frame(TEXT, b"") + frame(CONTINUED, b"") * MAX_FRAGMENTS)
+            with pytest.raises(ConnectionClosed) as closed:
+                page.recv(timeout=5.0)
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == CloseCode.MESSAGE_TOO_BIG
 
 
 def test_a_page_that_does_not_read_delays_the_end_by_little() -> None:

@@ -307,15 +307,14 @@ async def _forward(scene: ClientConnection, browser: ServerConnection) -> None:
 async def _discard(browser: ServerConnection) -> None:
     """Read and drop a browser's messages, so that pings are answered and its end is noticed."""
     try:
-        while True:
-            async for _ in browser.recv_streaming(decode=False):
-                pass
+        while await _next_message(browser) is not None:
+            pass
     except ConnectionClosed:
         return
 
 
 async def _next_message(connection: ServerConnection) -> bytes | None:
-    """Return the next message of a page, or None after too many fragments.
+    """Return the next message of a browser, or None after too many fragments.
 
     Raises ConnectionClosed at its end.
     """
