@@ -68,8 +68,8 @@ A browser sends the cookies of all programs on this host in one line, which may 
 """
 MAX_REQUEST_BYTES = 2 * MAX_HEADER_LINE_BYTES
 """Largest size of a request with all its headers."""
-RECEIVE_BUFFER_BYTES = 8192
-"""Size of the system's buffer for what a connection has received.
+RECEIVE_BUFFER_BYTES = 2304
+"""Size of the system's buffer for what a connection has received: the smallest of Linux.
 
 The server parses such a buffer in one go. A flood from one page delays STOP of another by the time
 for one buffer.
