@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -119,3 +120,12 @@ def test_there_is_nothing_but_enclaves_in_the_list_of_enclaves() -> None:
     builder = ElementTree.TreeBuilder(insert_comments=True)
     policy = ElementTree.parse(FOLDER / "policy.xml", ElementTree.XMLParser(target=builder))
     assert {one.tag for one in policy.iterfind("enclaves/")} == {"enclave"}
+
+
+def test_the_documentation_names_each_enclave() -> None:
+    policy = ElementTree.parse(FOLDER / "policy.xml")
+    names = {one.attrib["path"].removeprefix("/quadvel/") for one in policy.iterfind("enclaves/enclave")}
+    page = (FOLDER.parents[1] / "docs" / "security.md").read_text()
+    _, _, after = page.partition("| enclave `/quadvel/...` | used by |")
+    rows = after.partition("\n\n")[0].splitlines()[2:]
+    assert {name for row in rows for name in re.findall(r"`([a-z_]+)`", row.split("|")[1])} == names

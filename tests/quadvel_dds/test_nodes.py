@@ -1,5 +1,6 @@
 """Tests of nodes in one process: names, services, logs, creation and destruction."""
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -93,6 +94,21 @@ def test_service_answers(ros: Start) -> None:
         rclpy.spin_until_future_complete(node, future, timeout_sec=10.0)
     assert [future.result().success for future in futures] == [True, False]
     assert futures[0].result().message == "as asked"
+
+
+def test_the_time_to_forget_a_request_does_not_depend_on_their_number(
+    ros: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ros()
+    client = Node("caller").create_client(SetBool, "nowhere")
+    monkeypatch.setattr(client._endpoint, "ask", lambda request, number: None)
+    futures = [client.call_async(SetBool.Request()) for _ in range(10_000)]
+    start = time.process_time()
+    for future in futures:
+        client.remove_pending_request(future)
+        client.remove_pending_request(future)
+    assert time.process_time() - start < 1.0
+    assert not client._pending
 
 
 def test_absent_service_is_not_ready(ros: Start) -> None:

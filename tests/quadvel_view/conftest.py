@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
+import quadvel_dds
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_recordings.definitions import STORE
 from quadvel_recordings.recorded import _default
 from quadvel_view.picture import TOPICS
 from tests.helpers.robots import ALIENGO
+
+quadvel_dds.install()  # before a test module imports rclpy
 
 SPEED = 0.5  # m/s
 SECONDS = 3.0

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from importlib.resources import files
 
@@ -61,6 +64,24 @@ def test_a_page_of_another_origin_sees_topics_and_publishes_nothing(server) -> N
         channel = {"id": 1, "topic": "/cmd_vel", "encoding": "json", "schemaName": "geometry_msgs/msg/Twist"}
         client.send(json.dumps({"op": "advertise", "channels": [channel]}))
         assert "clientPublish" in json.loads(client.recv(timeout=10.0))["message"]
+
+
+def test_nothing_that_a_page_sends_reaches_the_terminal() -> None:
+    """In another process, because the log of the SDK is set once."""
+    program = """
+import time
+from websockets.sync.client import connect
+from quadvel_view.foxglove_live import FoxgloveServer
+
+server = FoxgloveServer("127.0.0.1", 0)
+with connect(server.url, subprotocols=["foxglove.sdk.v1"], origin="https://example.com") as client:
+    client.send('{"op":"subscribe\x1b[31m"}')
+    client.ping().wait(10.0)
+server.close()
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "FOXGLOVE_LOG_LEVEL"}
+    ran = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, timeout=60.0)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, b"", b"")
 
 
 def test_other_hosts_are_refused_as_nobody_shows_a_token_here() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from mcap.writer import Writer
 from quadvel_description.robot import load_robot
 from quadvel_recordings.definitions import STORE
 from quadvel_recordings.reading import RecordingError
+from quadvel_view import playback, replay
 from quadvel_view.page_protocol import Pace, Seek, Stop
+from quadvel_view.picture import RobotPicture
 from quadvel_view.playback import Playback
 from quadvel_view.replay import execute
 
@@ -96,3 +99,43 @@ def test_the_robot_is_the_one_that_the_recording_names(tmp_path: Path, walked: P
     assert Playback(walked, "go2").picture.robot is go2
     with pytest.raises(ValueError, match=r"go2\.mcap: robot is 'go2', expected 'aliengo'"):
         Playback(path, "aliengo")
+
+
+def test_the_trail_is_built_from_a_limited_number_of_messages(
+    walked: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    film = Playback(walked)
+    built: list[str] = []
+    monkeypatch.setattr(playback, "MAX_TRAIL_MESSAGES", 80)
+    monkeypatch.setattr(RobotPicture, "update_lazily", lambda self, topic, *_: built.append(topic))
+    film.seek(SECONDS)
+    assert built.count("/odom") <= 80 + 1  # the newest once more
+
+
+class FloodedViewer:
+    """A page that sends very many orders at once, and more with each frame."""
+
+    url, is_watched = "http://nowhere", True
+
+    def __init__(self, robot: Any, host: str, port: int, on_message: Any, on_disconnect: Any) -> None:
+        self._send = on_message
+        self.show(None, None, 0.0)
+
+    def show(self, picture: Any, operator: Any, now: float, **more: Any) -> None:
+        for step in range(5000):
+            self._send(1, Seek(step / 5000))
+            self._send(1, Pace(1.0))
+
+    def close(self) -> None:
+        pass
+
+
+def test_of_many_jumps_at_once_the_newest_counts_and_the_replay_goes_on(
+    walked: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jumps: list[float] = []
+    frames = iter([False, False, True])
+    monkeypatch.setattr(replay, "Viewer", FloodedViewer)
+    monkeypatch.setattr(Playback, "seek", lambda self, time: jumps.append(time))
+    replay.replay(walked, None, "127.0.0.1", 0, lambda wait: next(frames), lambda url: None)
+    assert jumps == [0.0, 4999 / 5000, 4999 / 5000]  # the first by the playback itself

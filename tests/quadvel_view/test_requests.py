@@ -70,6 +70,27 @@ def test_a_header_that_makes_no_sense_is_named(here: PageServer, headers: list[b
     assert body.count(b"\n") == 1
 
 
+@pytest.mark.parametrize(
+    "named",
+    [
+        b"Connection",
+        b"Sec-WebSocket-Key",
+        b"Sec-WebSocket-Version",
+        b"Sec-WebSocket-Extensions",
+        b"Sec-WebSocket-Protocol",
+    ],
+)
+def test_bytes_in_a_header_of_the_handshake_are_named_and_no_error_of_the_server(
+    here: PageServer, named: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    others = [header for header in HANDSHAKE if not header.startswith(named + b":")]
+    headers = [HERE, b"Upgrade: websocket", *others, OURS, named + b": \xff"]
+    status, body = ask(here, *headers, path=b"/words")
+    assert status == 400
+    assert body.startswith(named)
+    assert not caplog.records
+
+
 def test_a_path_that_makes_no_sense_is_named(here: PageServer) -> None:
     status, body = ask(here, HERE, path=b"//[bad")
     assert status == 400
@@ -165,3 +186,22 @@ def test_no_request_is_an_error_of_the_server(
     )
     assert status < 500
     assert body or status in (0, 101)
+
+
+@pytest.mark.parametrize(
+    "others",
+    [[b"a=" + b"x" * 60_000], [b"a=" + b"x" * 30_000, b"b=" + b"y" * 30_000]],
+    ids=["in one header", "in two headers"],
+)
+def test_long_cookies_of_other_programs_on_the_host_keep_nobody_out(
+    here: PageServer, others: list[bytes]
+) -> None:
+    cookies = [b"Cookie: " + one for one in others]
+    assert ask(here, HERE, *cookies)[0] == 200
+    assert ask(here, HERE, b"Upgrade: websocket", *HANDSHAKE, OURS, *cookies, path=b"/words")[0] == 101
+
+
+def test_a_request_with_more_headers_than_any_browser_sends_is_not_kept_in_memory(here: PageServer) -> None:
+    headers = [HERE, *(b"X: " + b"x" * 60_000 for _ in range(100))]
+    with pytest.raises(ConnectionError):
+        ask(here, *headers)

@@ -9,6 +9,8 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from socket import create_connection as raw_socket
+from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -16,6 +18,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, ConnectionClosedError, InvalidMessage, InvalidStatus
 from websockets.frames import CloseCode
 from websockets.sync.client import connect
+from websockets.sync.server import unix_serve
 
 from quadvel_view.page_protocol import MAX_MESSAGE_BYTES, LetGo, Stop
 from quadvel_view.server import LOG, MAX_FRAGMENTS, MAX_SOCKETS, AddressError, PageServer
@@ -150,6 +153,41 @@ def test_a_long_message_is_refused_while_it_arrives(
     assert [word for word in heard if word != "left"] == []
 
 
+def test_the_scene_refuses_a_message_in_many_fragments(tmp_path: Path) -> None:
+    with ExitStack() as opened:
+        scene = opened.enter_context(
+            unix_serve(lambda connection: connection.recv(), str(tmp_path / "scene"))
+        )
+        Thread(target=scene.serve_forever, daemon=True).start()
+        opened.callback(scene.shutdown)
+        server = PageServer("127.0.0.1", 0, tmp_path / "scene", lambda *_: None, lambda _: None)
+        opened.callback(server.close)
+        port = urlsplit(server.url).port
+        with connect(f"ws://127.0.0.1:{port}/scene", origin=f"http://127.0.0.1:{port}") as page:
+            page.socket.sendall(frame(TEXT, b"") + frame(CONTINUED, b"") * MAX_FRAGMENTS)
+            with pytest.raises(ConnectionClosed) as closed:
+                page.recv(timeout=5.0)
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == CloseCode.MESSAGE_TOO_BIG
+
+
+def test_a_page_that_does_not_read_delays_the_end_by_little() -> None:
+    server = PageServer("127.0.0.1", 0, NOWHERE, lambda *_: None, lambda _: None)
+    with raw_socket(("127.0.0.1", urlsplit(server.url).port), 10.0) as page:
+        name = f"127.0.0.1:{urlsplit(server.url).port}"
+        page.sendall(
+            f"GET /words HTTP/1.1\r\nHost: {name}\r\nOrigin: http://{name}\r\nUpgrade: websocket\r\n"
+            "Connection: Upgrade\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+            "Sec-WebSocket-Version: 13\r\n\r\n".encode()
+        )
+        until = time.monotonic() + 10.0
+        while not server.is_watched and time.monotonic() < until:
+            time.sleep(0.01)
+        start = time.monotonic()
+        server.close()
+        assert time.monotonic() - start < 5.0
+
+
 def test_elsewhere_only_the_token_lets_in(everywhere: PageServer) -> None:
     token = urlsplit(everywhere.url).query.partition("=")[2]
     assert len(token) >= 20
@@ -177,3 +215,25 @@ def test_a_port_that_is_taken_is_told_in_one_sentence(here: PageServer) -> None:
 def test_an_address_that_does_not_exist_is_told_and_not_waited_for(host: str, port: int) -> None:
     with pytest.raises(AddressError):
         PageServer(host, port, NOWHERE, lambda page, word: None, lambda page: None)
+
+
+def test_floods_from_some_pages_delay_the_stop_of_another_by_few_orders(
+    here: PageServer, heard: list[Any]
+) -> None:
+    ours = f"http://127.0.0.1:{urlsplit(here.url).port}"
+    flood = frame(TEXT, b'{"do":"let_go"}', last=True) * 20_000
+    with ExitStack() as open_pages:
+        pages = [open_pages.enter_context(socket(here, ours)) for _ in range(5)]
+        senders = [Thread(target=page.socket.sendall, args=(flood,)) for page in pages[1:]]
+        for sender in senders:
+            sender.start()
+        until = time.monotonic() + 20.0
+        while len(heard) < 1000 and time.monotonic() < until:
+            time.sleep(0.001)
+        before = len(heard)
+        pages[0].send('{"do":"stop"}')
+        for sender in senders:
+            sender.join()
+        while Stop() not in heard and time.monotonic() < until:
+            time.sleep(0.01)
+    assert heard.index(Stop()) - before < 5_000

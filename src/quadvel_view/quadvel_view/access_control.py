@@ -17,6 +17,15 @@ from websockets.http11 import Request
 
 HOST = re.compile(r"(?P<name>\[(?P<v6>[0-9A-Fa-f:.]+)\]|[\w.-]+)(?P<port>:[0-9]{1,5})?", re.ASCII)
 
+HANDSHAKE_HEADERS = (
+    "Connection",
+    "Sec-WebSocket-Key",
+    "Sec-WebSocket-Version",
+    "Sec-WebSocket-Extensions",
+    "Sec-WebSocket-Protocol",
+)
+"""Headers that websockets reads."""
+
 
 class RequestError(Exception):
     """A rejected request.
@@ -81,6 +90,7 @@ class AccessControl:
             raise _forbidden(f"host '{visitor.name}' rejected: this page accepts this computer only")
         if visitor.wants_socket:
             _check_origin(_single_header(request, "Origin"), visitor)
+            _check_handshake(request)
         return visitor
 
     @staticmethod
@@ -134,6 +144,13 @@ def _check_origin(origin: str, visitor: Visitor) -> None:
     ours = f"{visitor.name}{visitor.port}"
     if origin not in (f"http://{ours}", f"https://{ours}"):
         raise _forbidden(f"cross-origin request from {origin!a} to '{ours}' rejected")
+
+
+def _check_handshake(request: Request) -> None:
+    """Refuse headers on which websockets fails instead of refusing them itself."""
+    for name in HANDSHAKE_HEADERS:
+        if not all(value.isascii() for value in request.headers.get_all(name)):
+            raise _bad_request(request, name, "ASCII text")
 
 
 def _single_header(request: Request, name: str) -> str:

@@ -43,6 +43,9 @@ class FoxgloveServer:
         self._kept: dict[str, bytes] = {}
         self._latched: set[str] = set()
         self._lock = Lock()
+        # The SDK logs what a client sends as it came, and any web page is a client: escape sequences
+        # would reach the terminal. Only its first call counts.
+        foxglove.set_log_level("CRITICAL")
         self._context = foxglove.Context()
         try:
             self._server = foxglove.start_server(

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -104,7 +105,7 @@ class Playback:
         self.picture.clear_history()
         if "/odom" in self._tracks:
             behind = self._tracks["/odom"].between(self.time - TRAIL_DURATION_S, self.time)
-            for message in behind[:: max(1, len(behind) // MAX_TRAIL_MESSAGES)]:
+            for message in behind[:: max(1, math.ceil(len(behind) / MAX_TRAIL_MESSAGES))]:
                 self.picture.update_lazily("/odom", message, self.time)
         self._apply_between(-np.inf, self.time)
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from queue import Empty, SimpleQueue
 
 from .operator import Operator
+from .order_queue import OrderQueue
 from .page_protocol import Pace, PageMessage, Play, Seek
 from .playback import Playback
 from .viewer import FRAME_PERIOD_S, Viewer
@@ -39,10 +39,8 @@ def replay(
     """
     playback = Playback(path, robot)
     # The web server's thread fills the queue; this thread executes the orders between two frames.
-    orders: SimpleQueue[PageMessage] = SimpleQueue()
-    viewer = Viewer(
-        playback.picture.robot, host, port, lambda page, order: orders.put(order), lambda page: None
-    )
+    orders = OrderQueue()
+    viewer = Viewer(playback.picture.robot, host, port, orders.put, lambda page: None)
     idle = Operator()  # the page needs one; nobody drives a recorded robot
     try:
         announce(viewer.url)
@@ -52,7 +50,7 @@ def replay(
             if viewer.is_watched:
                 playback.advance(now - then)
             then = now
-            while (order := _next_or_none(orders)) is not None:
+            for _, order in orders.take_all():
                 execute(playback, order)
             viewer.show(
                 playback.picture,
@@ -81,11 +79,3 @@ def execute(playback: Playback, word: PageMessage) -> None:
             playback.seek(moment)
         case Pace(pace=pace):
             playback.set_pace(pace)
-
-
-def _next_or_none(orders: SimpleQueue[PageMessage]) -> PageMessage | None:
-    """Return the next queued order, or None."""
-    try:
-        return orders.get_nowait()
-    except Empty:
-        return None

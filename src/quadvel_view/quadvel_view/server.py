@@ -15,6 +15,7 @@ import asyncio
 import json
 import logging
 import secrets
+import socket
 from collections.abc import Callable
 from functools import cached_property
 from http import HTTPStatus
@@ -24,6 +25,7 @@ from threading import Event, Thread
 from typing import Any
 from urllib.parse import urlsplit
 
+from websockets import http11
 from websockets.asyncio.client import ClientConnection, unix_connect
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
@@ -59,6 +61,21 @@ MAX_SOCKETS = 32
 
 Each one delays the messages of the others, including STOP.
 """
+MAX_HEADER_LINE_BYTES = 65_536
+"""Largest size of a header line of a request.
+
+A browser sends the cookies of all programs on this host in one line, which may be long.
+"""
+MAX_REQUEST_BYTES = 2 * MAX_HEADER_LINE_BYTES
+"""Largest size of a request with all its headers."""
+RECEIVE_BUFFER_BYTES = 2304
+"""Size of the system's buffer for what a connection has received: the smallest of Linux.
+
+The server parses such a buffer in one go. A flood from one page delays STOP of another by the time
+for one buffer.
+"""
+CLOSE_TIMEOUT_S = 1.0
+"""Time for a browser to answer the end of its connection; a slow one does not delay Ctrl-C more."""
 # Hide everything of viser's page but the canvas. viser reconnects only while it has the focus,
 # which our page keeps.
 CANVAS_ONLY = (
@@ -82,6 +99,24 @@ LOG = logging.getLogger("quadvel_view.page")
 LOG.addFilter(_is_server_error)
 
 
+# websockets has no argument for this limit, only an environment variable that it reads on import.
+http11.MAX_LINE_LENGTH = MAX_HEADER_LINE_BYTES
+
+
+class _Connection(ServerConnection):
+    """A connection that ends if its request is longer than MAX_REQUEST_BYTES."""
+
+    _received = 0
+
+    def data_received(self, data: bytes) -> None:
+        """Handle received bytes."""
+        self._received += len(data)
+        if self.request is None and self._received > MAX_REQUEST_BYTES:
+            self.transport.abort()
+        else:
+            super().data_received(data)
+
+
 class PageServer:
     """Serves the page from construction until `close`, in its own thread.
 
@@ -101,7 +136,7 @@ class PageServer:
         host: str,
         port: int,
         scene: Path,
-        on_message: Callable[[int, PageMessage], None],
+        on_message: Callable[[int, PageMessage], object],
         on_disconnect: Callable[[int], None],
     ) -> None:
         if not host:
@@ -161,10 +196,14 @@ class PageServer:
                 self._port,
                 process_request=self._process_request,
                 select_subprotocol=lambda connection, offered: offered[0] if offered else None,
+                create_connection=_Connection,
                 compression=None,
                 max_size=MAX_MESSAGE_BYTES,
+                close_timeout=CLOSE_TIMEOUT_S,
                 logger=LOG,
             ) as server:
+                for listening in server.sockets:  # its connections inherit the size
+                    listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
                 self._port = next(iter(server.sockets)).getsockname()[1]
                 self._ready.set()
                 await self._stop.wait()
@@ -268,15 +307,14 @@ async def _forward(scene: ClientConnection, browser: ServerConnection) -> None:
 async def _discard(browser: ServerConnection) -> None:
     """Read and drop a browser's messages, so that pings are answered and its end is noticed."""
     try:
-        while True:
-            async for _ in browser.recv_streaming(decode=False):
-                pass
+        while await _next_message(browser) is not None:
+            pass
     except ConnectionClosed:
         return
 
 
 async def _next_message(connection: ServerConnection) -> bytes | None:
-    """Return the next message of a page, or None after too many fragments.
+    """Return the next message of a browser, or None after too many fragments.
 
     Raises ConnectionClosed at its end.
     """

@@ -28,7 +28,8 @@ from quadvel_msgs.srv import Push, ResetSim, SetMode
 from quadvel_nodes.node import StartError, read_parameters, run
 from quadvel_recordings.definitions import STORE
 
-from .operator import PUBLISH_PERIOD_S, Operator
+from .operator import PUBLISH_PERIOD_S, STOP_RETRY_S, Operator
+from .order_queue import OrderQueue
 from .page_protocol import Allow, Hold, LetGo, ModeRequest, PageMessage, Record, Release, Reset, Stop
 from .page_protocol import Push as PushWord
 from .picture import LATCHED, TOPICS, RobotPicture
@@ -75,6 +76,7 @@ class View(Node):
         settings = read_parameters(self, ViewParameters)
         robot = load_robot(settings.robot)
         self._picture, self._operator = RobotPicture(robot), Operator()
+        self._orders, self._calls = OrderQueue(), dict[Any, Any]()  # the last call of each client
         self._pending: dict[str, deque[bytes]] = {}
         self._status_text, self._stop_sent_at = "", 0.0
         self._recording = PageRecorder(settings.record_folder)
@@ -94,7 +96,7 @@ class View(Node):
         self._ends.callback(self._viewer.close)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(FRAME_PERIOD_S, self._draw, clock=steady)
-        self.create_timer(PUBLISH_PERIOD_S, self._publish_velocity, clock=steady)
+        self.create_timer(PUBLISH_PERIOD_S, self._obey, clock=steady)
         self.get_logger().info(f"open {self._viewer.url}")
 
     def destroy_node(self) -> None:
@@ -133,8 +135,13 @@ class View(Node):
             playback=None,
         )
 
+    def _obey(self) -> None:
+        """Execute the orders of the pages, then publish the velocity (20 Hz)."""
+        self._execute_orders()
+        self._publish_velocity()
+
     def _publish_velocity(self) -> None:
-        """Publish the held velocity (20 Hz), and repeat the STOP until the joints are damped."""
+        """Publish the held velocity, and repeat the STOP until the joints are damped."""
         now = time.monotonic()
         velocity = self._operator.velocity(now)
         if velocity is not None:
@@ -153,20 +160,23 @@ class View(Node):
         self._stop_sent_at = time.monotonic()
         self._call(self._set_mode, SetMode.Request(mode="passive"), "STOP")
 
-    # Messages of the page arrive in the server's thread and are executed in the executor's.
+    # Orders arrive in the server's thread. A timer of the executor executes them, because one task
+    # for each order would delay timers and subscriptions for as long as orders arrive.
 
-    def _on_message(self, page: int, word: PageMessage) -> None:
-        """Schedule the execution of a message."""
-        self._run_in_executor(partial(self._execute, page, word))
+    def _on_message(self, page: int, order: PageMessage) -> None:
+        """Queue an order; the first STOP does not wait for the timer."""
+        is_urgent = self._orders.put(page, order) and not self._operator.stopped
+        if is_urgent and self.executor is not None:
+            self.executor.create_task(self._execute_orders)
 
     def _on_disconnect(self, page: int) -> None:
-        """Schedule the end of the hold of a page that disconnected."""
-        self._run_in_executor(lambda: self._operator.end_hold(page, time.monotonic()))
+        """Queue the end of the hold of a page that disconnected."""
+        self._orders.put(page, LetGo())
 
-    def _run_in_executor(self, task: Any) -> None:
-        """Run a function in the executor's thread."""
-        if self.executor is not None:
-            self.executor.create_task(task)
+    def _execute_orders(self) -> None:
+        """Execute the waiting orders."""
+        for page, order in self._orders.take_all():
+            self._execute(page, order)
 
     def _execute(self, page: int, word: PageMessage) -> None:
         """Execute a message of the page.
@@ -175,9 +185,7 @@ class View(Node):
         """
         match word:
             case Stop():
-                self._operator.stop()
-                self.get_logger().warning("STOP was pressed on the page")
-                self._send_stop()
+                self._execute_stop()
             case Hold(velocity=velocity):
                 self._operator.hold(page, velocity, time.monotonic())
             case LetGo():
@@ -189,6 +197,15 @@ class View(Node):
                 self._status_text = self._recording.toggle()
             case _ if not self._operator.stopped:
                 self._execute_unless_stopped(word)
+
+    def _execute_stop(self) -> None:
+        """Latch the STOP. A repeat is transmitted again at most every STOP_RETRY_S."""
+        was_stopped = self._operator.stopped
+        self._operator.stop()
+        if not was_stopped:
+            self.get_logger().warning("STOP was pressed on the page")
+        if not was_stopped or time.monotonic() - self._stop_sent_at > STOP_RETRY_S:
+            self._send_stop()
 
     def _execute_unless_stopped(self, word: PageMessage) -> None:
         """Execute the orders that STOP blocks."""
@@ -217,7 +234,7 @@ class View(Node):
 
         def start_odometry() -> None:
             if self._reset_odometry.service_is_ready():
-                self._reset_odometry.call_async(Trigger.Request())
+                self._request(self._reset_odometry, Trigger.Request())
 
         if self._set_mode.service_is_ready():
             self._call(self._set_mode, SetMode.Request(mode="passive"), "passive", then=put_back)
@@ -238,7 +255,18 @@ class View(Node):
             if response.success:
                 then()
 
-        client.call_async(request).add_done_callback(answered)
+        self._request(client, request).add_done_callback(answered)
+
+    def _request(self, client: Any, request: Any) -> Any:
+        """Send a request and return its future.
+
+        An unanswered one of the same client is given up: a service that does not answer fills no
+        memory.
+        """
+        if client in self._calls:
+            client.remove_pending_request(self._calls[client])
+        self._calls[client] = client.call_async(request)
+        return self._calls[client]
 
 
 def _ready_client(clients: list[Any]) -> Any:

@@ -46,7 +46,7 @@ class Viewer:
         robot: Robot,
         host: str,
         port: int,
-        on_message: Callable[[int, PageMessage], None],
+        on_message: Callable[[int, PageMessage], object],
         on_disconnect: Callable[[int], None],
     ) -> None:
         try:

@@ -44,6 +44,7 @@ class Client(Partial):
         self.qos_profile = qos_profile
         self._numbers = itertools.count(1)
         self._pending: dict[int, Future] = {}
+        self._number_of: dict[Future, int] = {}  # the other way round: many requests may be pending
         self._lock = Lock()
 
     def call_async(self, request: Any) -> Future:
@@ -64,6 +65,7 @@ class Client(Partial):
         with self._lock:
             number = next(self._numbers)
             self._pending[number] = future
+            self._number_of[future] = number
         future.add_done_callback(self.remove_pending_request)
         self._endpoint.ask(request, number)
         return future
@@ -75,7 +77,9 @@ class Client(Partial):
             future: Future that `call_async` returned for the request.
         """
         with self._lock:
-            self._pending = {number: other for number, other in self._pending.items() if other is not future}
+            number = self._number_of.pop(future, None)
+            if number is not None:
+                del self._pending[number]
 
     def service_is_ready(self) -> bool:
         """Return whether a service is connected.
