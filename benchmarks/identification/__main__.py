@@ -24,6 +24,7 @@ from benchmarks.identification.contest import SharedLog, publish, read_truth, sh
 from benchmarks.identification.entrants import ENTRANTS, Answer
 from benchmarks.identification.judge import SCHEMA, judge, judgement_table, read_answers
 from benchmarks.provenance import last_commit, library_versions
+from quadvel_bringup.error_sentence import exit_with_sentence
 
 ENGINE = ("src/quadvel_actuator", "src/quadvel_sysid", "benchmarks/identification")
 NEEDS_TORCH = "network"
@@ -106,4 +107,5 @@ def judge_command(folder: FolderOption = FOLDER) -> None:
 
 
 if __name__ == "__main__":
-    app()
+    with exit_with_sentence("benchmarks.identification"):
+        app()
