@@ -103,6 +103,9 @@ LEFT_OUT = {
     "quadvel people --scans FOLDER --out out/people": "real scans that are no part of this repository; "
     "tests/quadvel_follow takes them where they are",
     "quadvel up --world campus": "as with --terrain",
+    'quadvel run board --ros-args -p hung:=true -p imu_mounting:="[0.03, 0.0]"': "as the next",
+    "quadvel run driver --ros-args -p board_address:=127.0.0.1 -p local_port:=0": "tests/end_to_end/test_board.py "
+    "walks behind board and driver; tests/quadvel_bringup/test_calibrate.py calibrates",
     "quadvel up --params stamped.yaml": "as the other ups; test_yaml_examples.py loads the file",
     "quadvel demo follow --view": "the same page; tests/end_to_end/test_follow_demo.py runs the demo",
     "quadvel up --view": "tests/quadvel_view/test_page.py opens its page",
