@@ -6,7 +6,8 @@ import hashlib
 import platform
 import subprocess
 from collections.abc import Sequence
-from importlib.metadata import version
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -38,9 +39,13 @@ def library_versions(distributions: Sequence[str]) -> dict[str, str]:
         distributions: Their names.
 
     Returns:
-        Versions by name.
+        Versions by name; without those that are not installed.
     """
-    return {"python": platform.python_version()} | {name: version(name) for name in distributions}
+    versions = {"python": platform.python_version()}
+    for name in distributions:
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    return versions
 
 
 def digest(path: Path) -> str:

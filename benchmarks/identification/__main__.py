@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,8 +24,10 @@ from benchmarks.identification.contest import SharedLog, publish, read_truth, sh
 from benchmarks.identification.entrants import ENTRANTS, Answer
 from benchmarks.identification.judge import SCHEMA, judge, judgement_table, read_answers
 from benchmarks.provenance import last_commit, library_versions
+from quadvel_bringup.error_sentence import exit_with_sentence
 
 ENGINE = ("src/quadvel_actuator", "src/quadvel_sysid", "benchmarks/identification")
+NEEDS_TORCH = "network"
 LIBRARIES = ("quadvel-core", "numpy", "scipy", "numba", "torch")
 app = typer.Typer(add_completion=False)
 FolderOption = Annotated[Path, typer.Option("--folder", metavar="<folder>", help="Folder of the contest.")]
@@ -59,9 +62,15 @@ def enter_command(
         raise typer.BadParameter(
             f"found {', '.join(sorted(unknown))}, expected some of {', '.join(ENTRANTS)}"
         )
-    (folder / "answers").mkdir(exist_ok=True)
+    chosen = names or list(ENTRANTS)
+    if NEEDS_TORCH in chosen and find_spec("torch") is None:
+        if names:
+            raise typer.BadParameter(f"{NEEDS_TORCH} needs PyTorch, not installed here: make test")
+        print(f"left out: {NEEDS_TORCH}, which needs PyTorch (make test installs it)")
+        chosen.remove(NEEDS_TORCH)
     logs = list(shared_logs(folder / "logs"))
-    for name in names or ENTRANTS:
+    (folder / "answers").mkdir(exist_ok=True)
+    for name in chosen:
         content = {
             "schema": SCHEMA,
             "entrant": name,
@@ -98,4 +107,5 @@ def judge_command(folder: FolderOption = FOLDER) -> None:
 
 
 if __name__ == "__main__":
-    app()
+    with exit_with_sentence("benchmarks.identification"):
+        app()

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from zipfile import BadZipFile
 
 import attrs
 import numpy as np
@@ -108,10 +109,16 @@ def read_shared(path: Path) -> SharedLog:
 
     Returns:
         The log.
+
+    Raises:
+        ValueError: The file is no such log.
     """
-    with np.load(path, allow_pickle=False) as file:
-        arrays: dict[str, Any] = dict(file)
-    known: Bools = np.isfinite(arrays["tau"]).all(axis=1)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays: dict[str, Any] = dict(file)
+        known: Bools = np.isfinite(arrays["tau"]).all(axis=1)
+    except (KeyError, TypeError, ValueError, BadZipFile) as error:
+        raise ValueError(f"{path}: is no log of `publish`: {error}") from None
     arrays["tau"] = np.nan_to_num(arrays["tau"], nan=0.0)
     with TemporaryDirectory() as folder:
         filled = Path(folder) / path.name

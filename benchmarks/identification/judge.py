@@ -44,9 +44,17 @@ def read_answers(path: Path, truths: Mapping[str, Json]) -> Json:
         Its content.
 
     Raises:
-        ValueError: The schema differs, or the torque of a log is missing or has another shape.
+        ValueError: The file is no such JSON, or the torque of a log is missing or has another shape.
     """
-    content: Json = json.loads(path.read_text())
+    try:
+        content: Json = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: found {type(content).__name__}, expected an object with the key schema")
+    missing = {"schema", "entrant", "logs"} - content.keys()
+    if missing:
+        raise ValueError(f"{path}: found no {', '.join(sorted(missing))}")
     if content.get("schema") != SCHEMA:
         raise ValueError(f"{path}: schema: found {content.get('schema')}, expected {SCHEMA}")
     for name, truth in truths.items():

@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 
 from benchmarks.tracking.entry import SIZES, entries_table, make_entry, read_entries
+from quadvel_bringup.error_sentence import exit_with_sentence
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_eval.cli import ClusterOption, walk_progress_bar
@@ -69,4 +70,5 @@ def table(size: SizeOption = "small", out: OutOption = OUT) -> None:
 
 
 if __name__ == "__main__":
-    app()
+    with exit_with_sentence("benchmarks.tracking"):
+        app()

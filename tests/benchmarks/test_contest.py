@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import sys
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
 
 import attrs
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from benchmarks import provenance
+from benchmarks.identification import __main__ as program
 from benchmarks.identification import contest, entrants, judge
 from quadvel_actuator import ActuatorParameters, DelayPair
 from quadvel_sysid.data.plain_model import fit_eam
@@ -113,3 +118,23 @@ def test_a_missing_or_short_prediction_is_refused_by_the_name_of_its_log(tmp_pat
         file.write_text(json.dumps({"schema": 1, "entrant": "mine", "logs": logs}))
         with pytest.raises(ValueError, match=rf"logs/log_000/torque: found shape {found}, expected \(2, 1\)"):
             judge.read_answers(file, {"log_000": TRUTH})
+
+
+def test_without_torch_the_entrant_that_needs_it_is_left_out(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def version_here(name: str) -> str:
+        if name == "torch":
+            raise PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.setattr(provenance, "version", version_here)
+    monkeypatch.setattr(program, "ENTRANTS", dict.fromkeys(("joint_pd", "network"), entrants.joint_pd))
+    done = CliRunner().invoke(program.app, ["enter", "--folder", str(folder)])
+    assert done.exit_code == 0, done.output
+    assert "left out: network" in done.output
+    content = json.loads((folder / "answers" / "joint_pd.json").read_text())
+    assert "numpy" in content["versions"]
+    assert "torch" not in content["versions"]
+    assert CliRunner().invoke(program.app, ["enter", "network", "--folder", str(folder)]).exit_code == 2

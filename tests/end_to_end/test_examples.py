@@ -87,7 +87,6 @@ NODES = [
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel", served=True),
     Step("quadvel run driver --ros-args -p dry_run:=true", served=True),
     Step("quadvel run driver --ros-args -p robot:=go2 -p dry_run:=true", served=True),
-    Step("quadvel run command_mux --ros-args -p stamped:=true", served=True),
     Step("quadvel run person_tracker --ros-args -p laser_x:=0.25", served=True),
     Step("quadvel run follow_planner --ros-args -p laser_x:=0.25 -p side:=left", served=True),
     Step("quadvel run trajectory_planner --ros-args -p file:=eight -p closed_loop:=true", served=True),
@@ -104,6 +103,10 @@ LEFT_OUT = {
     "quadvel people --scans FOLDER --out out/people": "real scans that are no part of this repository; "
     "tests/quadvel_follow takes them where they are",
     "quadvel up --world campus": "as with --terrain",
+    'quadvel run board --ros-args -p hung:=true -p imu_mounting:="[0.03, 0.0]"': "as the next",
+    "quadvel run driver --ros-args -p board_address:=127.0.0.1 -p local_port:=0": "tests/end_to_end/test_board.py "
+    "walks behind board and driver; tests/quadvel_bringup/test_calibrate.py calibrates",
+    "quadvel up --params stamped.yaml": "as the other ups; test_yaml_examples.py loads the file",
     "quadvel demo follow --view": "the same page; tests/end_to_end/test_follow_demo.py runs the demo",
     "quadvel up --view": "tests/quadvel_view/test_page.py opens its page",
     "quadvel view": "the same page, beside a robot that runs",
@@ -178,8 +181,8 @@ LEFT_OUT_KINDS = {
     r"quadvel policy import .*|python -m benchmarks\.imported_walk .*": "test_imported.py has policies",
     r"pixi run .*": "needs pixi and the network",
     r"mkdir -p out/checkpoints .*": "takes a checkpoint out of the history",
-    r"((driver|controller|command_mux|ros__parameters):|(stick_velocity|max_tilt|max_velocity): .*)": "a part of a parameter "
-    "file; test_yaml_examples.py loads it",
+    r"((driver|controller|command_mux|ros__parameters):|(stick_velocity|max_tilt|max_velocity|stamped): .*)": "a part "
+    "of a parameter file; test_yaml_examples.py loads it",
     r"\[project\.entry-points\..*|magnetic_drag = .*": "a part of another package's pyproject.toml; tests/quadvel_sysid has one",
     r"(t|q|dq|tau|kp|q_des|t_cmd|q_des_cmd|joint_names): .*": "a part of a map file for --columns",
 }

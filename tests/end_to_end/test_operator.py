@@ -295,4 +295,5 @@ def test_no_robot_is_no_success() -> None:
     environment = {**os.environ, "ROS_DOMAIN_ID": str(int(os.environ["ROS_DOMAIN_ID"]) // 4 * 4 + 3)}
     done = subprocess.run([*QUADVEL, "status"], capture_output=True, text=True, timeout=60, env=environment)
     assert done.returncode == 1
-    assert "no robot runs on ROS domain" in done.stdout
+    assert "no robot runs; start one: quadvel up" in done.stdout
+    assert done.stdout.count("ROS domain") == 1

@@ -72,7 +72,7 @@ def test_an_rclpy_too_old_for_real_time_on_two_cores_is_named(monkeypatch: pytes
     ("robot", "good", "text"),
     [
         ("aliengo", True, "AlienGo: crl_eam.onnx, estimator.onnx"),
-        ("go2", False, "policies/go2/crl_eam.onnx: no such file is shipped for the robot 'go2'"),
+        ("go2", False, "no policy is shipped for the robot 'go2'"),
         ("spot", False, "robot: found 'spot', expected aliengo, go2 or the path of a robot.yaml"),
     ],
 )

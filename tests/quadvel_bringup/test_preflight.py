@@ -71,8 +71,12 @@ def test_a_robot_without_a_board_that_is_known_here_has_no_driver(tmp_path: Path
             "robot: found 'spot', expected aliengo, go2 or the path of a robot.yaml",
         ),
         (
-            {"robot": "go2", "low_level": "external", "estimator": "kalman"},
-            r"policies/go2/crl_eam\.onnx: no such file is shipped for the robot 'go2'",
+            {"robot": "go2", "low_level": "driver"},
+            "no policy is shipped for the robot 'go2': name one with --policy FILE",
+        ),
+        (
+            {"robot": "go2", "low_level": "driver", "policy": Path("none")},
+            "no velocity estimator is shipped for the robot 'go2': .* --estimator kalman",
         ),
         (
             {"robot": "go2", "low_level": "driver", "estimator": "kalman", "policy": SHIPPED_POLICY},

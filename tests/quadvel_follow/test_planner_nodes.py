@@ -144,11 +144,14 @@ def test_before_anything_is_heard_the_follower_commands_zero_and_says_why(begin:
     assert peer.heard["follow_planner/state"][-1].data == "blind: there was no odometry yet"
 
 
-def test_a_way_is_walked_to_its_end_and_ends_with_zero(begin: Callable[..., Peer], tmp_path: Path) -> None:
+def test_a_way_is_walked_to_its_end_and_ends_with_zero(
+    begin: Callable[..., Peer], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "way.csv").write_text("seconds,vx,vy,wz\n0.5,0.4,0,0\n0.5,0.4,0,0.2\n")
     peer = begin(TrajectoryPlanner, "-p", f"file:={tmp_path / 'way.csv'}")
     peer.wait(lambda: peer.speeds("cmd_vel")[-1:] == [0.4])
     peer.wait(lambda: peer.speeds("cmd_vel")[-1] == 0.0)
+    assert "arrived" in "".join(capfd.readouterr())
 
 
 def test_in_closed_loop_a_way_begins_with_the_first_odometry(begin: Callable[..., Peer]) -> None:

@@ -81,4 +81,4 @@ def test_a_node_warns_once_of_each_conflict(
     assert until(lambda: watch.check() or warnings)
     watch.check()
     assert len(warnings) == 1
-    assert "stamped:=true" in warnings[0]
+    assert "stamped: true" in warnings[0]

@@ -121,3 +121,21 @@ def test_parameters_that_make_no_sense_are_refused_in_one_sentence(parameter: st
             CommandMuxNode()
     finally:
         rclpy.shutdown()
+
+
+def test_a_second_mux_on_the_same_topic_refuses_to_start(graph: Callable[..., Any]) -> None:
+    graph(CommandMuxNode)
+    with pytest.raises(StartError, match="command is already published"):
+        CommandMuxNode()
+
+
+def test_a_second_mux_on_a_topic_of_its_own_starts(graph: Callable[..., Any]) -> None:
+    others: list[Any] = []
+
+    def beside_another() -> CommandMuxNode:
+        others.append(rclpy.create_node("first", use_global_arguments=False))
+        others[0].create_publisher(VelocityCommand, "command", 10)
+        return CommandMuxNode()
+
+    node = graph(beside_another, "-r", "command:=/test/command").node
+    assert node.count_publishers("/test/command") == 1

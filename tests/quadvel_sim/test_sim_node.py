@@ -1,5 +1,6 @@
 """Tests of the node over DDS: topics, lockstep, services, refusals, shutdown."""
 
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -219,3 +220,13 @@ def test_a_bad_parameter_ends_the_start_with_one_sentence(
     assert status == 2
     assert sentence in text
     assert len(text.strip().splitlines()) == 1
+
+
+def test_without_an_actuator_file_the_model_is_named_a_plain_pd_law(
+    start: Start, peer: Any, tmp_path: Path
+) -> None:
+    for file in ALIENGO.folder.iterdir():
+        if file.name != "actuator.yaml":
+            shutil.copy(file, tmp_path)
+    start(robot=str(tmp_path))
+    peer.spin_until(lambda: "plain PD law" in peer.diagnosed()[1].get("actuator", ""))

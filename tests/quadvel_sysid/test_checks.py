@@ -200,6 +200,18 @@ def test_clipped_channels_and_joints_at_rest_are_named() -> None:
     assert found["clipped (N m)"] == ("FR_calf_joint",)
 
 
+def test_a_clipped_command_is_noted_and_a_held_or_constant_one_is_not() -> None:
+    t, q_des = fields()["t"], fields()["q_des"].copy()
+    swing = np.sin(2.0 * np.pi * 2.0 * t)  # 2 Hz: half a period takes 0.25 s
+    q_des[:, 0] = np.clip(0.2 * swing, -1.0, 0.15)
+    q_des[:, 1] = 0.2 * np.maximum(np.sin(2.0 * np.pi * t), 0.0)  # between two steps held for 0.5 s
+    q_des[:, 2] = np.where(swing > 0.0, 2.2e-16, 0.0)
+    q_des[:, 3] = 0.2 * np.maximum(np.sin(2.0 * np.pi * 3.0 * t), 0.0) ** 4  # comes to rest smoothly
+    found = [finding for finding in check_log(log(q_des=q_des)).findings if "clipped" in finding.text]
+    assert [(finding.field, finding.joints) for finding in found] == [("q_des", ("FR_hip_joint",))]
+    assert "FR_hip_joint at 0.15" in found[0].text
+
+
 def test_names_that_contradict_the_model_are_reported() -> None:
     order = list(np.roll(np.arange(12), 1))
     moved = {name: fields()[name][:, order] for name in ("q", "dq", "tau", "q_des")}

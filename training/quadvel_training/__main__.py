@@ -6,11 +6,11 @@ It runs the stages, each resumable, and tools for policy files.
 from __future__ import annotations
 
 import subprocess
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import attrs
-import torch
 import typer
 from rich.progress import Progress, TextColumn
 
@@ -21,6 +21,16 @@ from quadvel_estimator.kalman import KalmanConfig
 from quadvel_eval.paper import gap
 from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+
+try:
+    import torch
+except ModuleNotFoundError:
+    print(
+        "quadvel_training needs PyTorch, not installed here: in the checkout, run "
+        "pip install -c requirements.lock -e '.[train]'",
+        file=sys.stderr,
+    )
+    raise SystemExit(2) from None
 
 from . import (
     closing,

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 import warnings
 from collections.abc import Sequence
+
+from .error_sentence import exit_with_sentence
 
 STOPPED = tuple(128 + number for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM))
 """Exit codes of a command that a signal ended."""
@@ -27,28 +28,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     warnings.showwarning = _show_warning
     try:
-        app(arguments, prog_name="quadvel")  # shell completion needs this name, however quadvel was started
-    except (OSError, ValueError, MemoryError, RecursionError) as error:
-        if os.environ.get("QUADVEL_TRACEBACK"):
-            raise
-        print(f"quadvel: {_sentence(error)}", file=sys.stderr)
-        sys.exit(2)
+        with exit_with_sentence("quadvel"):
+            app(
+                arguments, prog_name="quadvel"
+            )  # shell completion needs this name, however quadvel was started
     except SystemExit as ended:
         if ended.code in STOPPED:
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process ends now; ignore further Ctrl-C
             print("quadvel: stopped; no file was left half-written", file=sys.stderr)
         raise
-
-
-def _sentence(error: Exception) -> str:
-    """Describe an error in one line; a system error by its file and reason."""
-    if isinstance(error, MemoryError):
-        return f"not enough memory on this machine: {error}"
-    if isinstance(error, RecursionError):
-        return f"the input is nested too deeply: {error}"
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
-    return " ".join(str(error).split())
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

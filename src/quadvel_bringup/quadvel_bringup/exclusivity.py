@@ -6,18 +6,17 @@ Two of them would send conflicting states and commands.
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from quadvel_nodes.publishers import DISCOVERY_TIME_S, has_publisher
+
 TOPIC = "low_state"
 ROBOT_PROGRAMS = ("sim_node", "board", "driver", "quadvel_lab.plant")
 """Words on the command lines of drivers and simulated robots."""
-DISCOVERY_TIME_S = 0.5
-"""Time to discover other publishers."""
 LOADED_DISCOVERY_TIME_S = 4.0
-"""The same if one of ROBOT_PROGRAMS runs on this machine, which may be busy and answer late."""
+"""Time to discover other publishers if one of ROBOT_PROGRAMS runs on this machine, which may be busy and answer late."""
 
 
 class RobotAlreadyRunningError(ConnectionError):
@@ -33,14 +32,11 @@ def ensure_exclusive(node: Any) -> None:
     Raises:
         RobotAlreadyRunningError: There is a publisher; the sentence names its process.
     """
-    deadline = time.monotonic() + (LOADED_DISCOVERY_TIME_S if robots_on_domain() else DISCOVERY_TIME_S)
-    while time.monotonic() < deadline:
-        if node.count_publishers(TOPIC):
-            raise RobotAlreadyRunningError(
-                f"{TOPIC}: already published on ROS domain {ros_domain()} by {_describe_robots()}. Stop it, or set "
-                "ROS_DOMAIN_ID to another number"
-            )
-        time.sleep(0.02)
+    if has_publisher(node, TOPIC, LOADED_DISCOVERY_TIME_S if robots_on_domain() else DISCOVERY_TIME_S):
+        raise RobotAlreadyRunningError(
+            f"{TOPIC}: already published on ROS domain {ros_domain()} by {_describe_robots()}. Stop it, or set "
+            "ROS_DOMAIN_ID to another number"
+        )
 
 
 def _describe_robots() -> str:

@@ -90,13 +90,15 @@ def check_stack(stack: Stack) -> None:
     """
     quadvel_dds.install()
     _check_file(stack.parameters)
-    robots = {}
-    for name, arguments in stack.arguments().items():
-        if name in NODE_CHECKS:
-            settings = check_node(name, arguments)
-            if hasattr(settings, "robot"):
-                robots[name] = settings.robot
-    _check_same_robot(robots)
+    arguments = stack.arguments()
+    checked = [name for name in arguments if name in NODE_CHECKS]
+    # The controller comes first: a robot without a policy needs no estimator.
+    settings = {name: check_node(name, arguments[name]) for name in sorted(checked, key=_is_not_controller)}
+    _check_same_robot({name: settings[name].robot for name in checked if hasattr(settings[name], "robot")})
+
+
+def _is_not_controller(name: str) -> bool:
+    return name != "controller"
 
 
 def check_node(name: str, arguments: Sequence[str]) -> Any:

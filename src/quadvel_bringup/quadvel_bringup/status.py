@@ -21,7 +21,6 @@ from quadvel_nodes.topic_types import all_conflicts
 
 from .discovery_hint import discovery_hint
 from .drive import twist_to_array, velocity_text
-from .exclusivity import ros_domain
 from .operator_commands import RECOVERY_HINT
 from .session import DISCOVERY_TIMEOUT_S, Session
 
@@ -76,7 +75,7 @@ def status() -> int:
         conflicts = all_conflicts(session.node)
     nodes = nodes_from_diagnostics(heard["/diagnostics"])
     if not nodes:
-        print(f"no robot runs on ROS domain {ros_domain()}; start one: quadvel up; {discovery_hint()}")
+        print(f"no robot runs; start one: quadvel up; {discovery_hint()}")
         return 1
     console = Console(soft_wrap=True, highlight=False)
     for name, text in [

@@ -22,7 +22,7 @@ def shipped_robots() -> tuple[str, ...]:
     return tuple(sorted(file.parent.name for file in ROBOTS.glob("*/robot.yaml")))
 
 
-def shipped_file(folder: Path, robot: str, name: str) -> Path:
+def shipped_file(folder: Path, robot: str, name: str, kind: str, remedy: str) -> Path:
     """Find a file that is shipped for a robot: in the subfolder of its name.
 
     Those of UNNAMED_ROBOT are in the folder itself.
@@ -31,6 +31,8 @@ def shipped_file(folder: Path, robot: str, name: str) -> Path:
         folder: Folder of the files of all robots.
         robot: Name of the robot.
         name: Name of the file.
+        kind: What the file holds, for the error.
+        remedy: What to do without it, for the error.
 
     Returns:
         The file.
@@ -40,9 +42,7 @@ def shipped_file(folder: Path, robot: str, name: str) -> Path:
     """
     path = folder / name if robot == UNNAMED_ROBOT else folder / robot / name
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{path}: no such file is shipped for the robot {robot!r}; name one of your own"
-        )
+        raise FileNotFoundError(f"no {kind} is shipped for the robot {robot!r}: {remedy}")
     return path
 
 

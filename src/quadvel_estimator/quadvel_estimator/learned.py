@@ -38,7 +38,8 @@ def shipped_estimator(robot: Robot) -> Path:
     Raises:
         FileNotFoundError: None is shipped for this robot.
     """
-    return shipped_file(_MODELS, robot.name, SHIPPED_MODEL.name)
+    remedy = "choose the Kalman filter with --estimator kalman"
+    return shipped_file(_MODELS, robot.name, SHIPPED_MODEL.name, "velocity estimator", remedy)
 
 
 class LearnedEstimator:

@@ -162,7 +162,8 @@ def bench_command(
         "out/bench.json"
     ),
     live: Annotated[
-        bool, typer.Option("--live", help="Measure the running nodes of a walking robot instead.")
+        bool,
+        typer.Option("--live", help="Start a simulated robot that walks, and measure its nodes instead."),
     ] = False,
     seconds: Annotated[float, typer.Option(min=1.0, metavar="<s>", help="Duration of --live, s.")] = 60.0,
     busy: Annotated[

@@ -360,10 +360,10 @@ class TrajectoryFollower:
             self._start = now
         x, y, yaw = _relative_pose(self._start, now)
         off = _relative_pose(np.array([x, y, yaw]), self._trajectory.pose[row])
-        if np.hypot(*off[:2]) > MAX_DEVIATION_M:
-            raise ValueError(
-                f"the robot is {np.hypot(*off[:2]):.2f} m off its way, expected {MAX_DEVIATION_M} m at most"
-            )
+        distance = np.hypot(*off[:2])
+        if distance > MAX_DEVIATION_M:
+            shown = np.ceil(100.0 * distance) / 100.0  # rounded up, so that it exceeds the limit, too
+            raise ValueError(f"the robot is {shown:.2f} m off its way, expected {MAX_DEVIATION_M} m at most")
         return velocity + np.clip(CORRECTION_GAINS * off, -MAX_CORRECTION, MAX_CORRECTION)
 
 

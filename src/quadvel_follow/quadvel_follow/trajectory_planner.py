@@ -90,6 +90,7 @@ class TrajectoryPlanner(Node):
             return
         twist = Twist()
         if velocity is None:  # the trajectory has ended: zero
+            self.get_logger().info("arrived")
             request_exit(self)
         else:
             twist.linear.x, twist.linear.y, twist.angular.z = velocity.tolist()

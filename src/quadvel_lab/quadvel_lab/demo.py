@@ -198,7 +198,8 @@ def _draw(recording: Recording, folder: Path, video: bool, console: Console) -> 
     if not encoder.good:
         console.print(f"no video: {encoder.text}", markup=False)
         return
-    with console.status("drawing the video"):
+    console.print("rendering the video of the walk; this may take minutes")
+    with console.status("rendering the video"):
         drawing = subprocess.run(
             [sys.executable, "-m", "quadvel_eval.video", folder / "demo.mcap", folder],
             env={**os.environ, "MUJOCO_GL": backend},

@@ -16,11 +16,11 @@ REMEDIES = {
     (
         "geometry_msgs/msg/TwistStamped",
         "geometry_msgs/msg/Twist",
-    ): "; the command mux takes it with -p stamped:=true",
+    ): "; the command mux takes it with stamped: true in its parameter file",
     (
         "geometry_msgs/msg/Twist",
         "geometry_msgs/msg/TwistStamped",
-    ): "; the command mux takes it with -p stamped:=false",
+    ): "; the command mux takes it with stamped: false in its parameter file",
 }
 
 

@@ -37,7 +37,8 @@ def shipped_policy(robot: Robot) -> Path:
     Raises:
         FileNotFoundError: None is shipped for this robot.
     """
-    return shipped_file(_POLICIES, robot.name, SHIPPED_POLICY.name)
+    remedy = "name one with --policy FILE"
+    return shipped_file(_POLICIES, robot.name, SHIPPED_POLICY.name, "policy", remedy)
 
 
 def load_policy(robot: Robot, path: str | Path | None = None) -> PolicyFile | ImportedPolicy:

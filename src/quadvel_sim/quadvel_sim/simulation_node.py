@@ -67,6 +67,10 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         self._settings, self._make_simulator = read_parameters(self, parameters), make_simulator
         simulator = make_simulator(self._settings.config())
         simulator.reset(self._settings.keyframe)
+        has_model = simulator.config.robot.actuator_file.exists()
+        self._own_actuator = (
+            "the robot's own" if has_model else "a plain PD law: the robot has no actuator.yaml"
+        )
         self._system_time = SystemTime()
         self._samples = 0
         self._given_up_before = 0.0
@@ -253,7 +257,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         level, summary = self._level_and_summary(report, warning)
         values = {
             "mode": self._loop.mode,
-            "actuator": self._settings.actuator_file or "the robot's own",
+            "actuator": self._settings.actuator_file or self._own_actuator,
             "realtime_factor": f"{report.realtime_factor:.3f}",
             "worst_lateness_ms": f"{1e3 * report.worst_lateness:.2f}",
             "given_up_s": f"{report.given_up:.3f}",

@@ -192,6 +192,19 @@ class Node(ParameterMixin):
         return True
 
     # Topics.
+    def resolve_topic_name(self, topic: str, *, only_expand: bool = False) -> str:
+        """Return the full name of a topic.
+
+        Args:
+            topic: Name of the topic.
+            only_expand: Not supported.
+
+        Returns:
+            Its name after expansion and remapping.
+        """
+        refuse_options("resolve_topic_name", only_expand=only_expand)
+        return self._resolve(topic)
+
     def _resolve(self, name: str, kind: str = "topic") -> str:
         """Return the full name of a topic or service after remapping."""
         if fault := names.fault(names.TOPIC, name):

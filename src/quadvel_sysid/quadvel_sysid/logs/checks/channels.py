@@ -33,6 +33,18 @@ REPEATED_ROWS_SHARE = 0.5
 """If more than this share of the rows in motion repeats the row before, the logger is faster than
 the state.
 """
+MIN_CLIP_ROWS, MIN_CLIP_VISITS = 3, 3
+"""Rows of one visit of an extreme value, and number of such visits, from which a channel is clipped."""
+MAX_CLIP_SHARE, MIN_CLIP_SHARE = 0.5, 0.002
+"""Share of the rows at the extreme value between which a channel is clipped."""
+HELD_COMMAND_S = 0.25
+"""s; a command that rests longer at an extreme value is a held posture, such as between two steps."""
+MIN_CLIP_STEP = 0.1
+"""Step of a command into the extreme value, relative to its mean step in motion, below which it comes
+to rest there by itself.
+"""
+CONSTANT_SPAN = 1e-9
+"""A channel that spans less is constant but for rounding."""
 RANGE_MARGIN_RAD = 0.4
 """rad beyond the model's joint range; from there the joint's name is doubted."""
 
@@ -251,7 +263,9 @@ def joint_ranges(log: Log) -> Iterator[Finding]:
 
 
 def clipped_channels(log: Log) -> Iterator[Finding]:
-    """Channels that stay at one extreme value again and again.
+    """Channels whose motion ends at one extreme value again and again.
+
+    A command that comes to rest smoothly, or is held for long, is a posture, not a clip.
 
     Args:
         log: The log to check.
@@ -263,11 +277,22 @@ def clipped_channels(log: Log) -> Iterator[Finding]:
         values = getattr(log, field)
         hit: dict[str, str] = {}
         for j, joint in enumerate(log.joints if values is not None else ()):
-            for bound in (float(values[:, j].min()), float(values[:, j].max())):
-                at = values[:, j] == bound
-                runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], at, [0]]))))[::2]
-                if np.sum(runs >= 3) >= 3 and 0.002 < at.mean() < 0.5:
-                    hit[joint] = f"{joint} at {bound:.4g} in {100 * at.mean():.1f} %"
+            channel = values[:, j]
+            if np.ptp(channel) < CONSTANT_SPAN:
+                continue
+            for bound in (float(channel.min()), float(channel.max())):
+                at = np.abs(channel - bound) < CONSTANT_SPAN
+                edges = np.flatnonzero(np.diff(np.concatenate([[0], at, [0]])))
+                first, runs = edges[::2], np.diff(edges)[::2]  # first row and number of rows of each run
+                if field == "q_des":
+                    steps = np.abs(np.diff(channel, prepend=channel[0]))
+                    abrupt = steps[first] >= MIN_CLIP_STEP * steps[steps > CONSTANT_SPAN].mean()
+                    runs = runs[abrupt & (runs * log.period <= HELD_COMMAND_S)]
+                share = runs.sum() / len(channel)
+                repeated = np.sum(runs >= MIN_CLIP_ROWS) >= MIN_CLIP_VISITS
+                if repeated and MIN_CLIP_SHARE < share < MAX_CLIP_SHARE:
+                    shown = 0.0 if abs(bound) < CONSTANT_SPAN else bound
+                    hit[joint] = f"{joint} at {shown:.4g} in {100 * share:.1f} %"
         if hit:
             text = f"{field}: clipped ({unit}): {format_names(list(hit.values()))} of the rows"
             yield Finding("note" if field == "q_des" else "warning", field, tuple(hit), text)
