@@ -435,9 +435,16 @@ def _ramp(by: float, within: float) -> Path:
     return lambda t: (by * min(t / within, 1.0), by / within if t < within else 0.0)
 
 
-def _swing(t: float) -> tuple[float, float]:
-    """Bend by 0.8 rad in 0.4 s, then return faster than a drive can."""
-    return (-2.0 * t, -2.0) if t < 0.4 else (min(17.0 * (t - 0.4) - 0.8, 0.0), 17.0 if t < 0.447 else 0.0)
+def _swing(speed: float) -> Path:
+    """Path that bends by 0.8 rad in 0.1 s, before the robot tips over, and returns with a speed, rad/s."""
+
+    def path(t: float) -> tuple[float, float]:
+        back = 0.1 + 0.8 / speed
+        return (
+            (-8.0 * t, -8.0) if t < 0.1 else (min(speed * (t - 0.1) - 0.8, 0.0), speed if t < back else 0.0)
+        )
+
+    return path
 
 
 def _prescribed_motion(joints: Sequence[int], path: Path) -> Change:
@@ -556,16 +563,17 @@ FAULTS = (
         "command_not_finite", "command", _not_a_velocity, mode="walk", finding_text="expected finite numbers"
     ),
     TopicFault(
-        "command_out_of_range", begin=_too_fast, mode="walk", finding_text="beyond what the policy can follow"
+        "command_out_of_range", begin=_too_fast, mode="walk", finding_text="exceeds the limits of the policy"
     ),
     TopicFault(
         "foot_force_frozen", change=_stuck("foot_force"), mode="walk", finding_text="the force of foot"
     ),
     TopicFault("target_out_of_range", begin=_too_fast, mode="walk"),
     *(
-        TopicFault(name, change=_prescribed_motion(CALVES, _swing))
-        for name in ("torque_jumps", "torque_too_large", "joint_at_speed_limit", "power_too_large")
+        TopicFault(name, change=_prescribed_motion(CALVES, _swing(speed=17.0)))  # drives reach 16 rad/s
+        for name in ("torque_jumps", "torque_too_large", "joint_at_speed_limit")
     ),
+    TopicFault("power_too_large", change=_prescribed_motion(CALVES, _swing(speed=15.0))),
 )
 """Faults of a simulated robot."""
 BOARD_FAULTS = (
