@@ -29,9 +29,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     warnings.showwarning = _show_warning
     try:
         with exit_with_sentence("quadvel"):
-            app(
-                arguments, prog_name="quadvel"
-            )  # shell completion needs this name, however quadvel was started
+            # Shell completion needs this name, however quadvel was started.
+            app(arguments, prog_name="quadvel")
     except SystemExit as ended:
         if ended.code in STOPPED:
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process ends now; ignore further Ctrl-C

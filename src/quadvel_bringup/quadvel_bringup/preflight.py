@@ -93,12 +93,8 @@ def check_stack(stack: Stack) -> None:
     arguments = stack.arguments()
     checked = [name for name in arguments if name in NODE_CHECKS]
     # The controller comes first: a robot without a policy needs no estimator.
-    settings = {name: check_node(name, arguments[name]) for name in sorted(checked, key=_is_not_controller)}
+    settings = {name: check_node(name, arguments[name]) for name in sorted(checked, key="controller".__ne__)}
     _check_same_robot({name: settings[name].robot for name in checked if hasattr(settings[name], "robot")})
-
-
-def _is_not_controller(name: str) -> bool:
-    return name != "controller"
 
 
 def check_node(name: str, arguments: Sequence[str]) -> Any:

@@ -146,12 +146,9 @@ class ScriptRunner:
             if mode in ("passive", "lie_down"):
                 raise ScriptError(f"the controller is in mode {mode} during '{step.name}': {reason}")
             return Action(step.name, velocity=step.velocity)
-        needs_no_request = mode in (
-            "",
-            step.mode,
-            step.awaited_mode,
-        )  # "": before the controller's first report
-        return Action(step.name, requested_mode=None if needs_no_request else step.mode)
+        # The mode is "" before the controller's first report.
+        is_needed = mode not in ("", step.mode, step.awaited_mode)
+        return Action(step.name, requested_mode=step.mode if is_needed else None)
 
     def _is_over(self, step: Step, elapsed: float, mode: str) -> bool:
         """Return whether a step has ended. Raises ScriptError after the timeout of a request."""

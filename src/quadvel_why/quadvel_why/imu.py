@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from itertools import permutations, product
+from operator import attrgetter
 
 import attrs
 import numpy as np
@@ -95,10 +96,6 @@ class Hypothesis:
         return (self.quaternion, self.gyroscope) == (USUAL_QUATERNION, USUAL_GYROSCOPE)
 
 
-def _error(hypothesis: Hypothesis) -> float:
-    return hypothesis.error
-
-
 class ImuHypotheses:
     """All hypotheses on one run with an IMU."""
 
@@ -116,7 +113,7 @@ class ImuHypotheses:
     @cached_property
     def best(self) -> Hypothesis:
         """The hypothesis that fits best; only one of both sensors deviates."""
-        return min(self._best_quaternion, self._best_gyroscope, key=_error)
+        return min(self._best_quaternion, self._best_gyroscope, key=attrgetter("error"))
 
     @property
     def is_ambiguous(self) -> bool:
@@ -126,12 +123,13 @@ class ImuHypotheses:
 
     @cached_property
     def _best_quaternion(self) -> Hypothesis:
-        return min((self._hypothesis(name, USUAL_GYROSCOPE) for name in QUATERNIONS), key=_error)
+        tried = (self._hypothesis(name, USUAL_GYROSCOPE) for name in QUATERNIONS)
+        return min(tried, key=attrgetter("error"))
 
     @cached_property
     def _best_gyroscope(self) -> Hypothesis:
-        names = (*GYROSCOPES, IN_WORLD)
-        return min((self._hypothesis(USUAL_QUATERNION, name) for name in names), key=_error)
+        tried = (self._hypothesis(USUAL_QUATERNION, name) for name in (*GYROSCOPES, IN_WORLD))
+        return min(tried, key=attrgetter("error"))
 
     def turns(self, quaternion: str) -> Array:
         """Return the turns of the trunk over windows of m states.

@@ -214,11 +214,9 @@ def _shortfall(signals: Signals) -> _Shortfall | None:
         x, y = asked[model.rows], given[model.rows]
         share = float(x @ y) / max(float(x @ x), 1e-9)
         magnitude = np.abs(y)
-        level = float(np.median(magnitude))
-        is_constant = (
-            robust_std(magnitude - level) < robust_std(y - share * x) and level > SHORT_OF * fit.spread
-        )
-        is_proportional = robust_std(y - share * x) < PROPORTIONAL * fit.spread and not is_constant
+        level, spread = float(np.median(magnitude)), robust_std(y - share * x)
+        is_constant = robust_std(magnitude - level) < spread and level > SHORT_OF * fit.spread
+        is_proportional = spread < PROPORTIONAL * fit.spread and not is_constant
         if is_proportional and share < 1.0 - CLEARLY_LESS:
             continue
         lacks = np.abs(asked) - given * np.sign(asked)

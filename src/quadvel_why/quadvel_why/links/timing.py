@@ -159,7 +159,7 @@ class LostCommands(Cause):
         lost = keep & (own > LOST_ERROR) & (own > LOST_BETTER * older)
         shows = lost | (keep & (error(change(1)) > VISIBLE * LOST_ERROR))
         share = float(lost.sum() / max(shows.sum(), MIN_TICKS))
-        j = int(np.argmax(np.where(sound, np.abs(run.tau[lost] - model.modelled[lost]).sum(axis=0), -1.0)))
+        j = int(np.argmax(np.where(sound, np.abs(left[lost]).sum(axis=0), -1.0)))
         trace = joint_trace(signals, j, model.modelled[:, j])
         sentence = (
             f"in {100 * share:.0f} % of the states in which a command clearly changes the torques, they follow an "
