@@ -34,6 +34,7 @@ def test_pd_law_leaves_friction_and_linear_filter_leaves_less(tmp_path: Path) ->
 
 
 REPORT = {
+    "reference_gains": {"kp": 30.0, "kd": 0.5, "commanded": True},
     "pd": {"heldout_mse": 2.0},
     "before": {"heldout_mse": 1.0},
     "after": {"heldout_mse": 0.3, "heldout_q_rms_rad": 0.01},
@@ -61,6 +62,11 @@ def test_error_line_lists_baselines_and_models() -> None:
         "held-out error, N^2 m^2: PD as commanded 2, a PD law of each joint 0.8, a linear filter over 16 ms 0.5, plain EAM 1, "
         "corrected model 0.3 (noise 0.25)"
     )
+
+
+def test_a_log_without_gains_has_no_commanded_pd_law() -> None:
+    reference = {"kp": 1.0, "kd": 1.0, "commanded": False}
+    assert "PD as commanded" not in error_line(REPORT | {"reference_gains": reference})
 
 
 @pytest.mark.parametrize(

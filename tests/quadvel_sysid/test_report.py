@@ -24,6 +24,7 @@ REPORT: dict[str, Any] = {
     "joints": JOINTS,
     "units": {"mse": "N² m²"},
     "noise_floor": 0.066,
+    "reference_gains": {"kp": 30.0, "kd": 0.5, "commanded": True},
     "pd": {"train_mse": 0.8, "heldout_mse": 0.82},
     "baselines": {"joint_pd": {"heldout_mse": 2.5}, "ridge": {"heldout_mse": 1.5}},
     "before": {

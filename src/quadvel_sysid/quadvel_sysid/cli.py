@@ -258,7 +258,7 @@ def error_line(report: Mapping[str, Any]) -> str:
         The line, with the share of the torque's variance that each model explains.
     """
     entries = (
-        ("PD as commanded", report["pd"]),
+        *((("PD as commanded", report["pd"]),) if report["reference_gains"]["commanded"] else ()),
         ("a PD law of each joint", report["baselines"]["joint_pd"]),
         (f"a linear filter over {1e3 * FILTER_SPAN_S:.0f} ms", report["baselines"]["ridge"]),
         ("plain EAM", report["before"]),

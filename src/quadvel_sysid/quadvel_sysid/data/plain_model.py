@@ -1,9 +1,11 @@
 """Empirical actuator model (EAM) of the paper, Section 3.1: PD gains and two delays.
 
 A grid search over both delays solves a linear regression for the gains at each pair. All joints
-share the gains. The pair with the least squared error is the model, and its residual is the noise.
-The cross products of the regressions separate into sums for each delay rather than each pair, which
-makes a grid finer than a millisecond affordable.
+share the gains. The pair with the least squared error is the model. An offset of a torque sensor or
+an encoder can decide between delays that are far apart: the first, coarse grid is searched with a
+constant of each joint as well, and the delays found so count if they explain the torque about its
+mean clearly better. The cross products of the regressions separate into sums for each delay rather
+than each pair, which makes a grid finer than a millisecond affordable.
 """
 
 from __future__ import annotations
@@ -23,12 +25,16 @@ MAX_INPUT_DELAY_S, MAX_OUTPUT_DELAY_S = 0.020, 0.006
 DRIVE_WINDOWS_S = (0.0, 0.001)
 """Steps of a drive to try, s; 0 for a drive without a step."""
 
+_LONGEST_S = MAX_INPUT_DELAY_S + MAX_OUTPUT_DELAY_S, MAX_OUTPUT_DELAY_S
+"""Upper bounds of the sum of both delays and of the output delay, s."""
 _COARSE_STEP_S = 0.001
 """Step of the first grid, s."""
 _REFINEMENTS_S = ((0.00075, 0.00025), (0.0002, 0.00005))
 """Half range around the best pair so far, and step, of each finer grid, s."""
 _COARSE_ROWS = 1500
 """Rows that the first grid uses."""
+_CLEARLY = 1.002
+"""Ratio of errors from which on a later candidate replaces the first one."""
 _CHUNK_ROWS = 20000
 """Rows of a partial sum, which bounds the memory."""
 
@@ -43,6 +49,7 @@ class Eam:
         output_delay: Output delay, (J,), s.
         window: Step of the drive, over which commands are averaged, s; 0 for none.
         mse: Mean squared error of the fitted rows, N^2 m^2.
+        variance: The same about the mean error of each joint, N^2 m^2.
     """
 
     gains: Array
@@ -50,6 +57,13 @@ class Eam:
     output_delay: Array
     window: float
     mse: float
+    variance: float
+
+    @property
+    def delays(self) -> tuple[float, float]:
+        """Sum of both delays, and output delay, s."""
+        output = float(self.output_delay[0])
+        return float(self.input_delay[0]) + output, output
 
     def predict(self, samples: Samples) -> Array:
         """Predict the torque of every row.
@@ -103,21 +117,30 @@ def fit_eam(samples: Samples, rows: Bools, windows: Sequence[float] = DRIVE_WIND
     coarse_rows[sampled] = rows[sampled]
     best, *others = (_search_delays(samples, coarse_rows, rows, window) for window in windows)
     for eam in others:
-        best = best if best.mse <= 1.002 * eam.mse else eam
+        best = best if best.mse <= _CLEARLY * eam.mse else eam
     return best
 
 
 def _search_delays(samples: Samples, coarse_rows: Bools, rows: Bools, window: float) -> Eam:
     """Best fit for one drive step: coarse grid on `coarse_rows`, then finer grids on all rows."""
-    longest = MAX_INPUT_DELAY_S + MAX_OUTPUT_DELAY_S, MAX_OUTPUT_DELAY_S
-    totals, outputs = (_delay_grid(end, _COARSE_STEP_S) for end in longest)
-    eam = _CrossProducts(samples, coarse_rows, totals, outputs, window, 0.0).best_fit()
+    totals, outputs = (_delay_grid(end, _COARSE_STEP_S) for end in _LONGEST_S)
+    coarse = _CrossProducts(samples, coarse_rows, totals, outputs, window, 0.0)
+    start, with_constants = coarse.best_fit(), coarse.best_fit(about_means=True)
+    best = _refine_delays(samples, rows, start)
+    if with_constants.delays == start.delays:
+        return best
+    other = _refine_delays(samples, rows, with_constants)
+    return best if best.variance <= _CLEARLY * other.variance else other
+
+
+def _refine_delays(samples: Samples, rows: Bools, eam: Eam) -> Eam:
+    """Best fit on finer grids about the delays of `eam`."""
     for reach, step in _REFINEMENTS_S:
-        about = eam.input_delay[0] + eam.output_delay[0], eam.output_delay[0]
+        about = eam.delays
         totals, outputs = (
-            _delay_grid(end, step, near, reach) for end, near in zip(longest, about, strict=True)
+            _delay_grid(end, step, near, reach) for end, near in zip(_LONGEST_S, about, strict=True)
         )
-        eam = _CrossProducts(samples, rows, totals, outputs, window, about[0]).best_fit()
+        eam = _CrossProducts(samples, rows, totals, outputs, eam.window, about[0]).best_fit()
     return eam
 
 
@@ -154,7 +177,10 @@ class _CrossProducts:
             at: Age of the gains that count at a row, s.
         """
         self._totals, self._outputs, self._window, self._at = totals, outputs, window, at
-        self._joints, self._count = len(samples.joints), int(rows.sum())
+        self._counts = rows.sum(axis=0)
+        joints = len(self._counts)
+        self._c, self._d, self._z = np.zeros((3, len(totals), joints))  # sums over the rows
+        self._q, self._v = np.zeros((2, len(outputs), joints))
         self._aa, self._ab, self._bb, self._az, self._bz, self._zz = np.zeros((6, len(totals), len(outputs)))
         offset = 0
         for series in samples.sources.series:
@@ -186,26 +212,54 @@ class _CrossProducts:
         self._az += _row_products(c, z)[:, None] - z @ q.T
         self._bz += _row_products(d, z)[:, None] - z @ v.T
         self._zz += _row_products(z, z)[:, None]
+        for total, signal in ((self._c, c), (self._d, d), (self._z, z), (self._q, q), (self._v, v)):
+            total += signal.reshape(len(signal), len(t), -1).sum(axis=1)
 
-    def best_fit(self) -> Eam:
+    def _products(self, about_means: bool) -> tuple[Array, ...]:
+        """The cross products aa, ab, bb, az, bz and zz, (T, D) each; also about the means of each joint."""
+        products = self._aa, self._ab, self._bb, self._az, self._bz, self._zz
+        if not about_means:
+            return products
+        # sum (x - mean x) (y - mean y) = x'y - (sum x) (sum y) / n, joint by joint
+        share = 1.0 / np.maximum(self._counts, 1)
+        a, b = self._c[:, None] - self._q, self._d[:, None] - self._v  # (T, D, J)
+        z = np.broadcast_to(self._z[:, None], a.shape)
+        pairs = (a, a), (a, b), (b, b), (a, z), (b, z), (z, z)
+        return tuple(product - (x * y) @ share for product, (x, y) in zip(products, pairs, strict=True))
+
+    def best_fit(self, about_means: bool = False) -> Eam:
         """Solve all regressions.
 
+        Args:
+            about_means: Whether a constant of each joint takes part in the choice of the delays.
+
         Returns:
-            The pair of delays with the least mean squared error, with its gains.
+            The EAM with the pair of delays that has the least mean squared error.
         """
-        # Cramer's rule for [aa ab; ab bb] [g0 g1]' = [az bz]'; g1 = 0 where b is 0 or collinear to
-        # a.
-        aa, ab, bb, az, bz = self._aa, self._ab, self._bb, self._az, self._bz
-        det, ridge = aa * bb - ab * ab, 1e-12 * (aa + bb) ** 2 + 1e-300
-        g0 = np.where(det > ridge, (bb * az - ab * bz) / np.maximum(det, ridge), az / np.maximum(aa, 1e-300))
-        g1 = np.where(det > ridge, (aa * bz - ab * az) / np.maximum(det, ridge), 0.0)
-        mse = np.maximum(self._zz - g0 * az - g1 * bz, 0.0) / max(self._count, 1)
+        plain, centred = (_solve(*self._products(means)) for means in (False, True))
+        error = (centred if about_means else plain)[2]
         input_delays = self._totals[:, None] - self._outputs
         possible = (input_delays >= -1e-9) & (input_delays <= MAX_INPUT_DELAY_S + 1e-9)
-        at = np.unravel_index(np.argmin(np.where(possible, mse, np.inf)), mse.shape)
-        gains, delays = np.array([g0[at], g1[at]]), (max(input_delays[at], 0.0), self._outputs[at[1]])
-        ones = np.ones(self._joints)
-        return Eam(gains[:, None] * ones, delays[0] * ones, delays[1] * ones, self._window, float(mse[at]))
+        at = np.unravel_index(np.argmin(np.where(possible, error, np.inf)), error.shape)
+        delays = max(input_delays[at], 0.0), self._outputs[at[1]]
+        ones, count = np.ones(len(self._counts)), max(int(self._counts.sum()), 1)
+        return Eam(
+            gains=np.array([plain[0][at], plain[1][at]])[:, None] * ones,
+            input_delay=delays[0] * ones,
+            output_delay=delays[1] * ones,
+            window=self._window,
+            mse=float(plain[2][at]) / count,
+            variance=float(centred[2][at]) / count,
+        )
+
+
+def _solve(aa: Array, ab: Array, bb: Array, az: Array, bz: Array, zz: Array) -> tuple[Array, Array, Array]:
+    """Gains g_p and g_d and sum of squared errors of each pair of delays, (T, D) each."""
+    # Cramer's rule for [aa ab; ab bb] [g0 g1]' = [az bz]'; g1 = 0 where b is 0 or collinear to a.
+    det, ridge = aa * bb - ab * ab, 1e-12 * (aa + bb) ** 2 + 1e-300
+    g0 = np.where(det > ridge, (bb * az - ab * bz) / np.maximum(det, ridge), az / np.maximum(aa, 1e-300))
+    g1 = np.where(det > ridge, (aa * bz - ab * az) / np.maximum(det, ridge), 0.0)
+    return g0, g1, np.maximum(zz - g0 * az - g1 * bz, 0.0)
 
 
 def _stack_rows(signals: Iterable[Array]) -> Array:

@@ -206,6 +206,8 @@ def _report(o: Outcome) -> dict[str, Any]:
         "units": UNITS,
         "noise_floor": floor,
         "heldout_variance": variance,
+        "reference_gains": dict(zip(("kp", "kd"), samples.reference_gains, strict=True))
+        | {"commanded": samples.commanded},
         "pd": mses["pd"],
         "before": mses["before"]
         | {

@@ -65,14 +65,21 @@ def _tiles(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Key figures: errors, gains and delays."""
     before, after = report["before"], report["after"]
     unit = f"{report['units'].get('mse', 'N² m²')}, held out"
+    reference = report["reference_gains"]
+    if reference["commanded"]:
+        ideal = [_error_tile(report["pd"], f"ideal PD, {unit}")]
+        gains = (f"{before['delta_kp']:+.3g} / {before['delta_kd']:+.3g}", "ΔKp, ΔKd of the plain EAM")
+    else:  # nothing was commanded that a PD law could have, or deviate from
+        kp, kd = (reference[name] + before[f"delta_{name}"] for name in ("kp", "kd"))
+        ideal, gains = [], (f"{kp:.3g} / {kd:.3g}", "Kp, Kd of the plain EAM; none is in the log")
     return [
-        _error_tile(report["pd"], f"ideal PD, {unit}"),
+        *ideal,
         _error_tile(before, f"plain EAM, {unit}"),
         _error_tile(report["baselines"]["joint_pd"], "a PD law of each joint"),
         _error_tile(report["baselines"]["ridge"], "a linear filter over 16 ms"),
         _error_tile(after, f"corrected model, {unit}"),
         (number_text(report["noise_floor"]), "noise floor, N² m²"),
-        (f"{before['delta_kp']:+.3g} / {before['delta_kd']:+.3g}", "ΔKp, ΔKd of the plain EAM"),
+        gains,
         (f"{before['input_delay_ms']:.2f} / {before['output_delay_ms']:.2f}", "its delays, ms, in and out"),
     ]
 

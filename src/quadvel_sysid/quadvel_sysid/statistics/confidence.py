@@ -198,21 +198,31 @@ class _Covariance:
 
 
 def _inseparable(model: Model, covariance: _Covariance) -> Iterator[InseparablePair]:
-    """Pairs of parameters that no joint separates, apart from pairs within one effect."""
+    """Pairs of parameters that no joint separates, apart from pairs within one effect.
+
+    Weights of a learned term mean nothing alone: the term is a single parameter here.
+    """
     names, owners = ["delta_kp", "delta_kd"], ["delta_kp", "delta_kd"]
     for k, effect in enumerate(model.effects):
-        names += [f"{effect.candidate.name}.{name}" for name in effect.candidate.names]
+        term = effect.candidate.name
+        learned = effect.candidate.penalty is not None
+        names += [term if learned else f"{term}.{name}" for name in effect.candidate.names]
         owners += [str(k)] * len(effect.candidate.names)
     names, owners = [*names, "input_delay", "output_delay"], [*owners, "input_delay", "output_delay"]
     every = np.stack([covariance.correlations(j) for j in range(covariance.index.shape[1])])
     fitted = covariance.index >= 0
+    found: dict[tuple[str, str], InseparablePair] = {}
     for a in range(len(names)):
         for b in range(a + 1, len(names)):
             joints = np.flatnonzero(fitted[a] & fitted[b])
             size = np.abs(every[joints, a, b])
             if owners[a] != owners[b] and len(joints) and size.min() >= _INSEPARABLE_CORRELATION:
                 joint = int(joints[np.argmin(size)])
-                yield InseparablePair((names[a], names[b]), joint, float(every[joint, a, b]))
+                pair = InseparablePair((names[a], names[b]), joint, float(every[joint, a, b]))
+                found[pair.names] = max(
+                    found.get(pair.names, pair), pair, key=lambda one: abs(one.correlation)
+                )
+    yield from found.values()
 
 
 def _form_error(model: Model, index: int, rows: Bools) -> Array:
