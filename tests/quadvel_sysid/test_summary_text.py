@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from quadvel_sysid.report.summary_text import (
+    inseparable_warnings,
     leave_one_out,
     leave_one_out_text,
     summary_text,
     withheld_summary,
 )
+from quadvel_sysid.statistics.confidence import InseparablePair
 
 
 def report(*effects: tuple[str, float]) -> dict[str, Any]:
@@ -104,3 +106,11 @@ def test_logs_that_are_left_out_in_turn_show_what_their_models_share() -> None:
     text = leave_one_out_text(entry)
     assert "error 1 before, 0.3 after" in text
     assert text.endswith("effects of all fits: armature; of some: learned_residual, cogging")
+
+
+def test_parameters_that_no_log_separates_are_named_once_in_groups() -> None:
+    pairs = [(("kp", "kd"), 0.96), (("c", "d"), 0.999), (("kd", "lag"), -0.97), (("lag", "kp"), -0.99)]
+    first, second = inseparable_warnings([InseparablePair(names, 0, size) for names, size in pairs])
+    assert first.startswith("c and d are not separable")
+    assert second.startswith("kp, kd and lag are not separable")
+    assert "if kp were known, the interval of lag would be 0.14 times as wide" in second

@@ -35,7 +35,7 @@ from ..model.applied_effect import AppliedEffect
 from ..model.torque_model import Model
 from ..search.regressors import RegressorCandidate
 from ..statistics.baselines import explained_share, torque_variance
-from ..statistics.confidence import InseparablePair, Intervals
+from ..statistics.confidence import Intervals
 from ..statistics.criterion import (
     SIGNIFICANCE_LEVEL,
     WHITENESS_LEVEL,
@@ -43,7 +43,7 @@ from ..statistics.criterion import (
     whiteness_p_values,
 )
 from .identification import Identification, Shape, Trace
-from .summary_text import summary_text
+from .summary_text import inseparable_warnings, summary_text
 
 SCHEMA = 1
 """Version of the format of report.json."""
@@ -237,7 +237,7 @@ def _report(o: Outcome) -> dict[str, Any]:
             f"{name} is at its bound: its value and interval are not valid" for name in o.half_widths.at_bound
         ]
         + _unconfirmed_warnings(o)
-        + [_inseparable_warning(one, list(samples.joints)) for one in o.half_widths.inseparable]
+        + inseparable_warnings(o.half_widths.inseparable)
         + _delay_spread_warnings(o.after)
         + _torque_limit_warnings(o),
     }
@@ -305,15 +305,6 @@ def _unconfirmed_warnings(o: Outcome) -> list[str]:
         for effect, evidence in zip(o.after.effects, o.evidence.effects, strict=True)
         if evidence.p_value > SIGNIFICANCE_LEVEL
     ]
-
-
-def _inseparable_warning(pair: InseparablePair, joints: Sequence[str]) -> str:
-    """Warning about two parameters of which only a combination is known."""
-    first, second = pair.names
-    return (
-        f"{first} and {second} are not separable in these logs (correlation of the estimates {pair.correlation:.3f} on "
-        f"{joints[pair.joint]}): if {second} were known, the interval of {first} would be {pair.conditional:.2f} times as wide"
-    )
 
 
 def _delay_spread_warnings(model: Model) -> list[str]:

@@ -10,6 +10,7 @@ from typing import Any
 
 from quadvel_actuator.effects.basis_regressors import LEARNED_RESIDUAL
 
+from ..statistics.confidence import InseparablePair
 from ..statistics.criterion import SIGNIFICANCE_LEVEL
 
 UNCORRELATED_TEXT = "uncorrelated with every logged signal; the cause may be too rare in the training rows"
@@ -204,3 +205,29 @@ def motion_summary(report: Mapping[str, Any]) -> dict[str, Any]:
         "after": report["after"] | {f"heldout_{name}": value for name, value in after.items()},
         "decision": decision,
     }
+
+
+def inseparable_warnings(pairs: Sequence[InseparablePair]) -> list[str]:
+    """Warnings about parameters of which only combinations are known, one for each connected group.
+
+    Args:
+        pairs: Pairs of parameters that the logs do not separate.
+
+    Returns:
+        A sentence for each group, with its worst pair.
+    """
+    groups: list[set[str]] = []
+    for pair in pairs:
+        joined = [group for group in groups if group & set(pair.names)]
+        groups = [group for group in groups if group not in joined]
+        groups.append(set(pair.names).union(*joined))
+    found = []
+    for group in groups:
+        inside = [pair for pair in pairs if pair.names[0] in group]
+        *others, last = dict.fromkeys(name for pair in inside for name in pair.names)
+        worst = min(inside, key=lambda pair: pair.conditional)
+        found.append(
+            f"{', '.join(others)} and {last} are not separable in these logs: if {worst.names[1]} were known, the "
+            f"interval of {worst.names[0]} would be {worst.conditional:.2f} times as wide"
+        )
+    return found
