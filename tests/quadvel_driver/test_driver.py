@@ -192,6 +192,7 @@ def test_states_and_commands_pass_through(
     assert controller.heard["imu"][-1].header.frame_id == "imu_link"
     controller.spin_until(lambda: controller.diagnosed()[0] == "commands are followed")
     values = controller.diagnosed()[1]
+    assert values["robot"] == "aliengo"
     assert values["tick_unit"] == "ms"
     assert values["RL_calf_joint temperature"] == "35"
     assert values["RL_calf_joint mode"] == "10"

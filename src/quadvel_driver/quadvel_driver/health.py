@@ -137,12 +137,13 @@ def diagnostic_values(report: LinkReport, newest: BoardState | None, robot: Robo
     Args:
         report: The report of the link.
         newest: The newest state, None before the first one.
-        robot: Names of the joints.
+        robot: The robot that is driven.
 
     Returns:
         Values by name.
     """
     values: dict[str, object] = {
+        "robot": robot.name,
         "state_rate_hz": f"{report.state_rate:.0f}",
         "send_rate_hz": f"{report.send_rate:.0f}",
         "silence_s": f"{report.silence:.3f}",
