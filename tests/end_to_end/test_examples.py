@@ -54,9 +54,10 @@ ROBOT = [
     Step("quadvel push --fy 60"),
     Step(
         "quadvel record low_state low_cmd --out walk.mcap --seconds 30",
-        more="--seconds 0.5 --out first.mcap",
+        more="--seconds 0.5 --out identified.mcap",
     ),
-    Step("quadvel record low_state low_cmd --out walk.mcap", more="--seconds 0.5 --out second.mcap"),
+    Step("quadvel record low_state low_cmd --out first.mcap", more="--seconds 0.5"),
+    Step("quadvel record low_state low_cmd --out run.mcap", more="--seconds 0.5"),
     Step("quadvel reset"),
     Step("quadvel reset --terrain slope --slope 0.175"),
     Step("quadvel mode passive"),

@@ -178,6 +178,11 @@ def test_status_shows_nodes_mode_rates_and_files_on_one_page(up: Robot) -> None:
     assert re.search(r"rates +low_state \d+, velocity_estimate \d+, ", text), text
     assert "battery" in text
     assert "temperatures" in text
+    assert "FR_calf" not in text
+    code, text = quadvel("status", "--joints")
+    assert code == 0, text
+    assert re.search(r"FR_calf +-1\.\d+ rad, +-?0\.\d+ rad/s, +\d+\.\d+ N m", text), text
+    assert re.search(r"imu +roll -?[01]\.\d, pitch -?[01]\.\d degrees", text), text
 
 
 def test_the_doctor_says_which_actuator_model_runs(up: Robot) -> None:

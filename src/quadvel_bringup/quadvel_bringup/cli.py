@@ -464,16 +464,19 @@ def enable(
 
 
 @app.command(rich_help_panel=ROBOT)
-def status() -> None:
+def status(
+    joints: Annotated[bool, typer.Option("--joints", help="Show joints and IMU, too.")] = False,
+) -> None:
     """Show nodes, mode, velocity, rates and files of the robot.
 
-    Exit code 1 if no robot runs, or its controller is in fault.
+    Exit code 1 if no robot runs, its controller is missing or in fault, or a node reports an error.
 
     \b
     For example:
       quadvel status
+      quadvel status --joints
     """
-    raise typer.Exit(_with_middleware("status").status())
+    raise typer.Exit(_with_middleware("status").status(joints))
 
 
 @app.command(rich_help_panel=SIMULATOR)

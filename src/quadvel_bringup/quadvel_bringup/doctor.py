@@ -228,7 +228,11 @@ def _torch() -> Finding:
     try:
         version = metadata.version("torch")
     except metadata.PackageNotFoundError:
-        return Finding("torch", True, "not installed; only training needs it: pip install -e '.[train]'")
+        return Finding(
+            "torch",
+            True,
+            "not installed; only training needs it: pip install -c requirements.lock -e '.[train]'",
+        )
     return Finding("torch", True, f"{version}: training can run")
 
 

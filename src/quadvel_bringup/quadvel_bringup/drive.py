@@ -91,7 +91,9 @@ class DriveRun:
         if state.mode_name == "fault":
             return f"the robot is in fault: {state.reason}\nonce the cause is gone: {RECOVERY_HINT}"
         if not state.rate_hz:  # over the last second
-            return "the controller receives no states: is the simulator paused?"
+            return (
+                "the controller receives no states: is the simulator paused? Does the driver reach its robot?"
+            )
         return str(state.walk_refusal)
 
     def send(self) -> None:

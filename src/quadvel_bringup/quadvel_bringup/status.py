@@ -10,11 +10,14 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import attrs
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rich.console import Console
 
+from quadvel_description.kinematics import roll_pitch
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_msgs.msg import ControllerState, LowState, VelocityCommand
 from quadvel_nodes.number_text import number_text
 from quadvel_nodes.topic_types import all_conflicts
@@ -63,11 +66,15 @@ class NodeReport:
     values: dict[str, str]
 
 
-def status() -> int:
+def status(joints: bool = False) -> int:
     """Print the status of the running robot.
 
+    Args:
+        joints: Whether to print joints and IMU, too.
+
     Returns:
-        The exit code: 1 if no robot runs, or its controller is missing or in fault.
+        The exit code: 1 if no robot runs, its controller is missing or in fault, or a node reports an
+        error.
     """
     with Session("status") as session:
         heard = {topic: session.listen(kind, topic, keep=1000) for topic, kind in STATUS_TOPICS.items()}
@@ -83,10 +90,12 @@ def status() -> int:
         *(("topic", f"[yellow]warning[/] {conflict}") for conflict in conflicts),
         *_lines(heard),
         *_equipment(nodes),
+        *(_measurements(heard["low_state"]) if joints else ()),
     ]:
         console.print(f"{name:13} {text}")
     states = heard["controller/state"]
-    return 1 if not states or states[-1].mode_name == "fault" else 0
+    failed = any(node.level == DiagnosticStatus.ERROR for node in nodes.values())
+    return 1 if failed or not states or states[-1].mode_name == "fault" else 0
 
 
 def running_nodes() -> dict[str, NodeReport]:
@@ -176,7 +185,26 @@ def _equipment(nodes: Mapping[str, NodeReport]) -> Iterator[tuple[str, str]]:
         yield key, values.get(key, "not reported by any node")
     yield "battery", values.get("battery", "not reported by the low-level interface")
     temperatures = [f"{key} {value}" for key, value in sorted(values.items()) if "temperature" in key]
-    yield "temperatures", ", ".join(temperatures) or "not reported: a simulated robot has none"
+    yield (
+        "temperatures",
+        ", ".join(temperatures) or "not reported: a simulated robot has none, a driver only with its robot",
+    )
+
+
+def _measurements(states: deque[Any]) -> Iterator[tuple[str, str]]:
+    """Yield name and values of the IMU and of each joint in the last state."""
+    if not states:
+        yield "joints", "no low_state is received"
+        return
+    state = states[-1]
+    roll, pitch = np.degrees(roll_pitch(np.array(state.orientation_wxyz)))
+    x, y, z = state.angular_velocity
+    yield (
+        "imu",
+        f"roll {roll:.1f}, pitch {pitch:.1f} degrees; turn rates x {x:.2f}, y {y:.2f}, z {z:.2f} rad/s",
+    )
+    for name, q, dq, tau in zip(JOINT_NAMES, state.q, state.dq, state.tau, strict=True):
+        yield name.removesuffix("_joint"), f"{q:7.3f} rad, {dq:6.2f} rad/s, {tau:6.2f} N m"
 
 
 def _rate(messages: deque[Any]) -> float:

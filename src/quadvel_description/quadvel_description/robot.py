@@ -52,7 +52,9 @@ def load_robot(robot: str) -> Robot:
     file = path / "robot.yaml" if path.is_dir() else path
     if not file.is_file():
         names = ", ".join(shipped_robots())
-        raise FileNotFoundError(f"robot: found {robot!r}, expected {names} or the path of a robot.yaml")
+        raise FileNotFoundError(
+            f"robot: found {robot!r}, expected {names} or the path of a folder or of its robot.yaml"
+        )
     fields = read_document(file, "a YAML file of a robot", SCHEMA)
     if undecided := [name for name, value in fields.items() if value == UNDECIDED]:
         raise ValueError(f"{file}: {', '.join(undecided)}: found {UNDECIDED!r}, expected your numbers")

@@ -352,7 +352,9 @@ def _load(entry: metadata.EntryPoint) -> Benchmark:
     try:
         benchmark: Benchmark = entry.load()
     except ImportError as error:
-        skipped = {"skipped": f"{error.name} is not installed; pip install -e '.[train]'"}
+        skipped = {
+            "skipped": f"{error.name} is not installed; pip install -c requirements.lock -e '.[train]'"
+        }
         return Benchmark(lambda: skipped, (("", entry.name, ""),))
     return benchmark
 

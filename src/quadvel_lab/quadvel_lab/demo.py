@@ -128,7 +128,7 @@ def demo_command(
         (folder / name).unlink(missing_ok=True)
     if problem:
         console.print(f"[bold red]{problem}")
-        if not lockstep:
+        if not lockstep and low_level == "sim":
             console.print(LOCKSTEP_HINT)
     try:
         recording = read_recording(recorded)

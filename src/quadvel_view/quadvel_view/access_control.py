@@ -9,6 +9,7 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import re
+import socket
 from http import HTTPStatus
 from urllib.parse import parse_qs, urlsplit
 
@@ -25,6 +26,10 @@ HANDSHAKE_HEADERS = (
     "Sec-WebSocket-Protocol",
 )
 """Headers that websockets reads."""
+
+
+DOCUMENTATION_ADDRESS = "192.0.2.1"
+"""Address that no host has (RFC 5737)."""
 
 
 class RequestError(Exception):
@@ -115,6 +120,25 @@ def is_loopback(host: str) -> bool:
         True for "localhost" and loopback addresses.
     """
     return ipaddress.ip_address(host).is_loopback if _is_address(host) else host == "localhost"
+
+
+def reachable_host(host: str) -> str:
+    """Return a host under which others reach a server that listens on `host`.
+
+    Args:
+        host: A name or an IP address without brackets.
+
+    Returns:
+        `host`; for the address of all interfaces, that of the default route or the name of this host.
+    """
+    if not _is_address(host) or not ipaddress.ip_address(host).is_unspecified:
+        return host
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect((DOCUMENTATION_ADDRESS, 9))  # sends nothing, but chooses a route
+            return str(probe.getsockname()[0])
+    except OSError:
+        return socket.gethostname()
 
 
 def _parse(request: Request) -> Visitor:

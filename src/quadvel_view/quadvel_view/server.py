@@ -35,7 +35,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from . import scene_server
-from .access_control import AccessControl, RequestError, Visitor, is_loopback
+from .access_control import AccessControl, RequestError, Visitor, is_loopback, reachable_host
 from .page_protocol import MAX_MESSAGE_BYTES, PageMessage, PageMessageError, parse_message
 
 COOKIE = "quadvel_view"
@@ -162,7 +162,8 @@ class PageServer:
     @property
     def url(self) -> str:
         """Address of the page, with the token if there is one."""
-        host = f"[{self._host}]" if ":" in self._host else self._host
+        host = reachable_host(self._host)
+        host = f"[{host}]" if ":" in host else host
         query = f"?token={self._guard.token}" if self._guard.token else ""
         return f"http://{host}:{self._port}/{query}"
 

@@ -33,7 +33,7 @@ PARTS: Mapping[str, str] = {
     "torque": "reported joint torques while the drives follow targets",
     "imu": "orientation, gyroscope and accelerometer",
     "robot": "a robot whose kinematics are known",
-    "policy": "modes, velocity estimate and the policy file",
+    "policy": "a walk from its beginning, with modes, velocity estimate and the policy file",
     "estimate": "the velocity estimate",
     "temperature": "motor_status",
     "command": "the commanded velocity",

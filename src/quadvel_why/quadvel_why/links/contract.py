@@ -79,7 +79,7 @@ class JointScale(Cause):
     link = Link.CONTRACT
     unit = "factor minus 1"
     least = 0.15
-    remedy = "Turn one joint by a known angle by hand and read it in `quadvel status`; correct the unit in the driver"
+    remedy = "Turn one joint by a known angle by hand and read it in `quadvel status --joints`; correct the unit in the driver"
 
     @override
     def measure(self, signals: Signals) -> Measurement | None:
@@ -398,7 +398,10 @@ class GyroFrame(Cause):
     unit = "times"
     least = 3.0
     needs = ("imu",)
-    remedy = "Turn the robot by hand about each axis and read `angular_velocity`; correct frame and unit in the driver"
+    remedy = (
+        "Turn the robot by hand about each axis and read the turn rates in `quadvel status --joints`; "
+        "correct frame and unit in the driver"
+    )
 
     @override
     def measure(self, signals: Signals) -> Measurement | None:
