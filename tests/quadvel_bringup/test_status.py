@@ -17,7 +17,7 @@ quadvel_dds.install()
 from geometry_msgs.msg import TwistWithCovarianceStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 
-from quadvel_bringup.status import STATUS_TOPICS, _lines, running_nodes  # noqa: E402
+from quadvel_bringup.status import STATUS_TOPICS, NodeReport, _equipment, _lines, running_nodes  # noqa: E402
 from quadvel_lab.demo import _report  # noqa: E402
 from quadvel_msgs.msg import ControllerState  # noqa: E402
 
@@ -86,3 +86,9 @@ def test_the_summary_of_a_demo_shows_dashes() -> None:
     )
     assert "RMSE –, –, – m/s" in shown.getvalue()
     assert "loop – Hz, period p99 – ms" in shown.getvalue()
+
+
+def test_the_hottest_temperatures_are_shown() -> None:
+    values = {f"joint {k} temperature": str(20 + k) for k in range(9)} | {"fan temperature": "unknown"}
+    shown = dict(_equipment({"driver": NodeReport(b"\0", "ok", values)}))["temperatures"]
+    assert shown == "joint 8 28, joint 7 27, joint 6 26 degrees C, the hottest of 9"

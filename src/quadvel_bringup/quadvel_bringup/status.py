@@ -184,11 +184,15 @@ def _equipment(nodes: Mapping[str, NodeReport]) -> Iterator[tuple[str, str]]:
     for key in FILE_KEYS:
         yield key, values.get(key, "not reported by any node")
     yield "battery", values.get("battery", "not reported by the low-level interface")
-    temperatures = [f"{key} {value}" for key, value in sorted(values.items()) if "temperature" in key]
-    yield (
-        "temperatures",
-        ", ".join(temperatures) or "not reported: a simulated robot has none, a driver only with its robot",
-    )
+    temperatures = {
+        key.removesuffix(" temperature"): int(value)
+        for key, value in values.items()
+        if key.endswith(" temperature") and value.lstrip("-").isdecimal()
+    }
+    hottest = sorted(temperatures, key=lambda name: temperatures[name], reverse=True)[:3]
+    listed = ", ".join(f"{name} {temperatures[name]}" for name in hottest)
+    missing = "not reported: a simulated robot has none, a driver only with its robot"
+    yield "temperatures", f"{listed} degrees C, the hottest of {len(temperatures)}" if listed else missing
 
 
 def _measurements(states: deque[Any]) -> Iterator[tuple[str, str]]:

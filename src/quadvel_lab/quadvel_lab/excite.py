@@ -122,7 +122,8 @@ class MotionPlayer:
         gap, self._last = state.time - self._last, state.time
         if not 0.0 <= gap <= MAX_STATE_GAP_S:
             raise MotionError(
-                f"the time between two states is {gap:.3f} s, expected 0 to {MAX_STATE_GAP_S} s"
+                f"the time between two states is {gap:.3f} s, expected 0 to {MAX_STATE_GAP_S} s: "
+                "robot, link or this computer was late; repeat it when the computer is idle"
             )
         self.elapsed = state.time - self._begin.time
         if self.is_done:
