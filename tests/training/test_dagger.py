@@ -71,7 +71,7 @@ def test_the_teacher_knows_what_was_done_20_ms_ago(run):
     teacher, seen = run.teacher, []
     for i in range(6):
         seen.append(teacher._executed[0][0, 0])
-        teacher.advance(np.full((8, 12), i, np.float32))
+        teacher.advance(run.env.command, np.full((8, 12), i, np.float32))
     assert seen == [0, 0, 0, 0, 0, 1]
 
 

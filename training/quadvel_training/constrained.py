@@ -25,11 +25,12 @@ from quadvel_sim.terrain import Terrain
 
 from . import dagger, privileged, process_group
 from .command_grid import CommandGrid, GridConfig
+from .command_shift import CommandShift
 from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, TimeShares, linear, load
 from .networks import Gaussian, Mlp, Recurrent, State, torch_mirror
 from .ppo import RECURRENT_PPO, Ppo, PpoConfig, Rollout, exploration_scales
-from .privileged import ACTION_BOUND, CommandScorer, Past, velocity_error
+from .privileged import CommandScorer, Past, velocity_error
 from .randomisation import Randomisation, load_actuator
 from .rewards import RewardWeights, Table2
 from .walking_rewards import error_magnitudes
@@ -144,7 +145,10 @@ class ConstrainedRun:
         )
         self.env = VelocityEnv(env_config, self.grid)
         self.past = Past(self.env)
-        self.teacher = dagger.Teacher(load(teacher), self.env, self.past) if teacher else None
+        self.shift = CommandShift(dagger.SHIFT_SEQUENCES)
+        if "shift" in known:
+            self.shift.restore(known["shift"])
+        self.teacher = dagger.Teacher(load(teacher), self.env, self.shift) if teacher else None
         self.rewards = Table2(self.env, c.rewards)
         self.scorer = CommandScorer(c.n)
         network = dagger.load_policy(start) if start else Recurrent(OBSERVATION_SIZE, 12)
@@ -209,6 +213,7 @@ class ConstrainedRun:
             "critic": self.critic.state_dict(),
             "learner": self.ppo.state(),
             "grid": self.grid.state(),
+            "shift": self.shift.state(),
             "samples": self.samples,
             "updates": self.updates,
             "random": {"learner": torch.get_rng_state(), "environments": self.env.rng.bit_generator.state},
@@ -225,6 +230,7 @@ class ConstrainedRun:
         self.critic.load_state_dict(state["critic"])
         self.ppo.restore(state["learner"])
         self.grid.restore(state["grid"])
+        self.shift.restore(state["shift"])
         self.samples, self.updates = state["samples"], state["updates"]
         process_group.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
@@ -304,7 +310,7 @@ class ConstrainedRun:
             with self.shares.measure("sensing"):
                 past.advance(command)
                 if self.teacher:
-                    self.teacher.advance(action.clip(-ACTION_BOUND, ACTION_BOUND))
+                    self.teacher.advance(command, action)
                 reward = self.rewards(action)
                 # R = Table 2 - stride |e_stride| - lasting |e_lasting|, xy and yaw
                 lasting = np.where(command[:, 3] > 0.5, c.standing, c.lasting)

@@ -7,6 +7,9 @@ The driver of a robot changes only with an episode: a teacher that takes over fr
 student falls far more often than by itself, and its advice is worth little. Each robot has a fixed
 place in the order in which the student takes over. If drivers were drawn for each episode, few
 robots would stay with a student that falls soon.
+
+The student removes steady errors less than its teacher does, so the teacher follows shifted commands
+(`command_shift`).
 """
 
 from __future__ import annotations
@@ -36,6 +39,7 @@ from quadvel_sim.terrain import Terrain
 
 from . import privileged, process_group
 from .command_grid import CommandGrid, GridConfig
+from .command_shift import CommandShift
 from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, CheckpointError, cosine, linear, load, set_rate
 from .networks import Recurrent, State, select
@@ -48,6 +52,7 @@ from .walking_rewards import SAMPLE_S, error_magnitudes
 HOLD_TICKS = round(SAMPLE_S / TICK_S)  # the teacher learned with actions held for so long
 AVERAGED_TICKS = 3
 """Ticks over which the teacher's actions are averaged: held actions act late by as much"""
+SHIFT_SEQUENCES = 30  # from one change of the shifted commands to the next: a million samples of 512 robots
 
 
 @attrs.frozen
@@ -100,7 +105,7 @@ class DaggerConfig:
 
 
 class Teacher:
-    """Teacher of a checkpoint, evaluated at every tick, with averaged actions.
+    """Teacher of a checkpoint, evaluated at every tick, with averaged actions and shifted commands.
 
     Actions are averaged over `AVERAGED_TICKS`, because it learned with actions held for 20 ms.
     Evaluated at every tick without the average, it falls where it does not fall otherwise (decision
@@ -109,29 +114,33 @@ class Teacher:
     Attributes:
         actor: policy of the teacher.
         env: environments.
+        shift: what it follows beyond the commands.
+        past: past of the robots, relative to the shifted commands.
     """
 
-    def __init__(self, checkpoint: dict[str, Any], env: VelocityEnv, past: Past) -> None:
+    def __init__(self, checkpoint: dict[str, Any], env: VelocityEnv, shift: CommandShift) -> None:
         """Load the teacher.
 
         Args:
             checkpoint: content of a checkpoint of `privileged`.
             env: environments.
-            past: past of their robots, which the caller advances.
+            shift: what it follows beyond the commands.
         """
         self.actor = privileged.load_teacher(checkpoint)
-        self.env, self._past = env, past
+        self.env, self.shift, self.past = env, shift, Past(env)
         n = env.config.n
         self._executed = deque([np.zeros((n, 12), np.float32) for _ in range(HOLD_TICKS)], HOLD_TICKS)
         self._recent = np.zeros((AVERAGED_TICKS, n, 12), np.float32)  # newest first
         self._starts = np.ones(n, bool)
 
-    def reset(self, ids: np.ndarray) -> None:
+    def reset(self, ids: np.ndarray, other_pair: np.ndarray | bool = False) -> None:
         """Clear the past of some robots.
 
         Args:
             ids: their indices.
+            other_pair: (len(ids),) bool, whether their walks start with the feet FL and RR.
         """
+        self.past.reset(ids, other_pair)
         for action in self._executed:
             action[ids] = 0.0
         self._starts[ids] = True
@@ -142,23 +151,35 @@ class Teacher:
         Returns:
             (n, 12), action in the network's unit.
         """
-        obs = privileged.observe(self.env, self._past, self._executed[0])
+        command = self.env.command + self.shift.of(self.env.command)
+        obs = privileged.observe(self.env, self.past, self._executed[0], command)
         with torch.no_grad():
             correction: np.ndarray = self.actor(torch.from_numpy(obs))[0].numpy()
-        now = privileged.total_action(self.env, self._past, correction)
+        now = privileged.total_action(self.env, self.past, correction)
         self._recent = np.concatenate([now[None], self._recent[:-1]])
         self._recent[:, self._starts] = now[self._starts]
         self._starts[:] = False
         mean: np.ndarray = self._recent.mean(axis=0)
         return mean
 
-    def advance(self, executed: np.ndarray) -> None:
-        """Record the actions of a tick.
+    def advance(self, command: np.ndarray, executed: np.ndarray) -> None:
+        """Record a tick.
 
         Args:
+            command: (n, 4), command that was in force.
             executed: (n, 12), actions taken, in the network's unit.
         """
-        self._executed.append(executed.copy())
+        self.past.advance(command + self.shift.of(command))
+        self._executed.append(executed.clip(-ACTION_BOUND, ACTION_BOUND))
+
+    def stride_error(self) -> np.ndarray:
+        """Compute the error over a stride, relative to the commands as they are.
+
+        Returns:
+            (n, 3), command minus velocity in vx, vy (m/s) and yaw rate (rad/s).
+        """
+        error: np.ndarray = self.past.stride - self.shift.of(self.env.command)[:, :3]
+        return error
 
 
 class DaggerRun:
@@ -189,8 +210,7 @@ class DaggerRun:
             randomisation=c.randomisation,
         )
         self.env = VelocityEnv(env_config, self.grid)
-        self.past = Past(self.env)
-        self.teacher = Teacher(checkpoint, self.env, self.past)
+        self.teacher = Teacher(checkpoint, self.env, CommandShift(SHIFT_SEQUENCES))
         self.student = Recurrent(OBSERVATION_SIZE, 12)
         self.map = action_map(self.env)
         self.optimiser = torch.optim.Adam(self.student.parameters(), lr=c.learning_rate)
@@ -211,6 +231,7 @@ class DaggerRun:
             "student": self.student.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "grid": self.grid.state(),
+            "shift": self.teacher.shift.state(),
             "samples": self.samples,
             "random": {"learner": torch.get_rng_state(), "environments": self.env.rng.bit_generator.state},
         }
@@ -223,6 +244,7 @@ class DaggerRun:
         """
         self.student.load_state_dict(state["student"])
         self.optimiser.load_state_dict(state["optimiser"])
+        self.teacher.shift.restore(state["shift"])
         self.samples = state["samples"]
         process_group.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
@@ -237,12 +259,11 @@ class DaggerRun:
         if not len(ids):
             return
         self.env.reset(ids)
-        self.teacher.reset(ids)
         self.driven[ids] = self._turn[ids] < self._share()
         # The student starts with FR and RL. Half of the teacher's robots start with the other pair,
         # so that the student takes its phase from the motion, and walks mirrored as well.
         other_pair = ~self.driven[ids] & (self.env.rng.random(len(ids)) < 0.5)
-        self.past.reset(ids, other_pair)
+        self.teacher.reset(ids, other_pair)
         self._previous[ids] = self._noise[ids] = 0.0
         self._memory = (self._memory[0].clone(), self._memory[1].clone())
         for memory in self._memory:
@@ -299,10 +320,11 @@ class DaggerRun:
             masks.append(alive.copy())
             command = env.command.copy()
             env.tick(self.map.targets(self._previous))
-            self.past.advance(command)
-            self.teacher.advance(self._previous.clip(-ACTION_BOUND, ACTION_BOUND))
+            self.teacher.advance(command, self._previous)
             fell |= env.fallen & alive
             alive &= ~(env.fallen | env.timed_out)
+        steady = self.driven & alive & self.teacher.past.settled & (env.command[:, 3] < 0.5)
+        self.teacher.shift.add(env.command[steady], self.teacher.stride_error()[steady])
         masks[-1] = alive  # robots that end in the last tick count as ended, too
         self.samples += c.length * c.n * process_group.size()
         obs_t, label_t, mask_t = (
@@ -312,7 +334,7 @@ class DaggerRun:
 
     def _figures(self, alive: np.ndarray, fell: np.ndarray) -> dict[str, float]:
         """Return errors over a stride (m/s, rad/s) and falls per robot-minute, by driver."""
-        error = self.past.stride
+        error = self.teacher.stride_error()
         seen = {"driven": float(self.driven.mean())}
         for name, driver in (("student", self.driven), ("teacher", ~self.driven)):
             up, minutes = driver & alive, driver.sum() * self.config.length * TICK_S / 60

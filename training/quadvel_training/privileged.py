@@ -173,7 +173,9 @@ def velocity_error(env: VelocityEnv, command: np.ndarray) -> np.ndarray:
     return np.asarray(command[:, :3] - velocity)
 
 
-def observe_state(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
+def observe_state(
+    env: VelocityEnv, past: Past, previous: np.ndarray, command: np.ndarray | None = None
+) -> np.ndarray:
     """Observations of the true state, for the critics of all stages.
 
     They are the paper's 48 numbers, feet, height, past errors, ground and plant.
@@ -182,13 +184,14 @@ def observe_state(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndar
         env: environments.
         past: their past.
         previous: (n, 12), action of the teacher `SAMPLE_S` ago.
+        command: (n, 4), commands to follow; None for those of the environments.
 
     Returns:
         (n, STATE_SIZE), scaled to about 1.
     """
     return np.concatenate(
         [
-            env.command,
+            env.command if command is None else command,
             2 * env.roll_pitch,
             2 * (env.q - env.robot.nominal_q),
             0.1 * env.dq,
@@ -209,19 +212,22 @@ def observe_state(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndar
     ).astype(np.float32)
 
 
-def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
+def observe(
+    env: VelocityEnv, past: Past, previous: np.ndarray, command: np.ndarray | None = None
+) -> np.ndarray:
     """Observations of the teacher: the true state and the clock.
 
     Args:
         env: environments.
         past: their past.
         previous: (n, 12), action of the teacher `SAMPLE_S` ago.
+        command: (n, 4), commands to follow; None for those of the environments.
 
     Returns:
         (n, OBSERVATION_SIZE), scaled to about 1.
     """
     clock = past.clock.observation().astype(np.float32)
-    return np.concatenate([observe_state(env, past, previous), clock], axis=1)
+    return np.concatenate([observe_state(env, past, previous, command), clock], axis=1)
 
 
 def total_action(env: VelocityEnv, past: Past, correction: np.ndarray) -> np.ndarray:

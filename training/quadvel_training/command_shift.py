@@ -1,0 +1,102 @@
+"""Commands for the teacher beyond those of its student, so that the student has no steady error.
+
+The teacher removes its steady errors by integrals over seconds. The student, which learns from
+sequences of a third of a second, copies them in part: at 1.5 m/s it is 0.1 m/s slow. So the teacher
+is asked for a shifted command. The shift grows by the student's own mean error at each command, as
+in integral control, until there is none. It is a smooth function of the command:
+
+    shift(c) = W phi(c),   W <- W + gain argmin_V sum_i |e_i - V phi(c_i)|^2 + ridge |V|^2
+
+where e_i is the command minus the velocity of a robot that the student drives, and phi are the
+monomials of vx, vy and yaw rate up to the third degree. The mirrored command gets the mirrored shift.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+
+SCALES = np.array([2.0, 1.0, 3.0])  # m/s, m/s, rad/s: commands of usual size, so that features are about 1
+MAX_SHIFT = np.array([0.3, 0.3, 0.6])  # m/s, m/s, rad/s
+MIRROR = np.array([1.0, -1.0, -1.0])  # of vx, vy and yaw rate, left for right
+MONOMIALS = [axes for degree in (1, 2, 3) for axes in combinations_with_replacement(range(3), degree)]
+GAIN = 0.6  # share of the mean error by which the shift grows
+RIDGE = 20.0  # robots that walk at the usual commands with no error
+
+
+class CommandShift:
+    """Shift of the commands that a teacher follows, learned from the errors of its student.
+
+    Attributes:
+        every: calls of `add` from one change of the shift to the next.
+    """
+
+    def __init__(self, every: int) -> None:
+        """Create a shift of zero.
+
+        Args:
+            every: calls of `add` from one change of the shift to the next.
+        """
+        self.every = every
+        self._weights = np.zeros((len(MONOMIALS), 3))
+        self._start_over()
+
+    def _start_over(self) -> None:
+        """Forget the errors since the last change."""
+        size = len(MONOMIALS)
+        self._calls, self._squares, self._products = 0, np.zeros((size, size)), np.zeros((size, 3))
+
+    def of(self, command: np.ndarray) -> np.ndarray:
+        """Evaluate the shift.
+
+        Args:
+            command: (n, 4), vx, vy (m/s), yaw rate (rad/s), 1 for stance.
+
+        Returns:
+            (n, 4), what to add; 0 in stance and in the last column.
+        """
+        shift = np.clip(_features(command) @ self._weights, -MAX_SHIFT, MAX_SHIFT)
+        shift[command[:, 3] > 0.5] = 0.0
+        return np.concatenate([shift, np.zeros((len(shift), 1))], axis=1).astype(command.dtype)
+
+    def add(self, command: np.ndarray, error: np.ndarray) -> None:
+        """Add steady errors of the student; every `every` calls they change the shift.
+
+        Args:
+            command: (n, 4), commands of walking robots.
+            error: (n, 3), command minus velocity in vx, vy (m/s) and yaw rate (rad/s).
+        """
+        for sign in (np.ones(3), MIRROR):
+            phi = _features(command[:, :3] * sign)
+            self._squares += phi.T @ phi
+            self._products += phi.T @ (error * sign)
+        self._calls += 1
+        if self._calls == self.every:
+            penalty = RIDGE * np.eye(len(MONOMIALS))
+            self._weights += GAIN * np.linalg.solve(self._squares + penalty, self._products)
+            self._start_over()
+
+    def state(self) -> dict[str, Any]:
+        """Return what a resumed run needs.
+
+        Returns:
+            Plain values, for `restore`.
+        """
+        return {"weights": self._weights.tolist()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Restore the shift; errors since its last change are forgotten.
+
+        Args:
+            state: what `state` returned.
+        """
+        self._weights = np.array(state["weights"])
+        self._start_over()
+
+
+def _features(command: np.ndarray) -> np.ndarray:
+    """Monomials (n, F) of commands (n, 3 or more)."""
+    scaled = command[:, :3] / SCALES
+    return np.stack([scaled[:, list(axes)].prod(axis=1) for axes in MONOMIALS], axis=1)
