@@ -17,7 +17,7 @@ import attrs
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
-from quadvel_description.arrays import Array, Bools
+from quadvel_description.arrays import Array, Bools, Indices
 from quadvel_description.kinematics import foot_positions, rotate, rotate_inverse
 from quadvel_description.robot import Robot
 
@@ -28,21 +28,22 @@ from .leg_dynamics import leg_torque
 __all__ = ["SIGNIFICANT_ERRORS", "CalibrationDataError", "CalibrationFit", "Samples", "fit_calibration"]
 
 SIGNIFICANT_ERRORS = 3.0
-"""Standard errors from which on an offset is significant; with two, every second sound robot of fourteen
-offsets would be corrected."""
+"""Standard errors from which on an offset is significant.
+
+With two, chance would exceed them in one of fourteen offsets on every second sound robot.
+"""
 TORQUE_NOISE_NM = 0.05
 """Standard deviation of a mean torque before the residuals are known, N m."""
 CORRELATION_SPANS_S = (BLOCK_S, 0.1, 0.5, 1.0, 2.0)
-"""Spans over which residuals are averaged, s: where they are correlated, means scatter more than white
-noise's."""
+"""Spans over which residuals are averaged, s: the means of correlated ones scatter more."""
 ZERO_PRIOR_RAD = 0.035
 """Prior standard deviation of an encoder zero, rad (2 deg)."""
 MOUNTING_PRIOR_RAD = 0.05
 """Prior standard deviation of the IMU's tilt, rad (3 deg)."""
 TORQUE_SCALE_PRIOR = 0.1
 """Prior standard deviation of the scale of measured torques."""
-TORQUE_OFFSET_PRIOR_NM = 0.001
-"""Prior standard deviation of the offset of measured torques, N m."""
+TORQUE_OFFSET_PRIOR_NM = 0.02
+"""Prior standard deviation of the offset of measured torques, N m: it resembles an encoder's."""
 FRICTION_PRIOR = 10.0
 """Prior standard deviation of Coulomb (N m) and viscous (N m s/rad) friction: they are free."""
 MIN_TORQUE_NOISE_NM = 0.005
@@ -56,7 +57,14 @@ _SENSORS = 14
 _TORQUE_KINDS = 4  # scale, Coulomb friction, viscous friction and offset of each joint
 _SIZE = _SENSORS + 12 * _TORQUE_KINDS
 _PRIOR_DEVIATIONS = np.repeat(
-    [ZERO_PRIOR_RAD, MOUNTING_PRIOR_RAD, TORQUE_SCALE_PRIOR, FRICTION_PRIOR, FRICTION_PRIOR, TORQUE_OFFSET_PRIOR_NM],
+    [
+        ZERO_PRIOR_RAD,
+        MOUNTING_PRIOR_RAD,
+        TORQUE_SCALE_PRIOR,
+        FRICTION_PRIOR,
+        FRICTION_PRIOR,
+        TORQUE_OFFSET_PRIOR_NM,
+    ],
     [12, 2, 12, 12, 12, 12],
 )
 
@@ -121,13 +129,15 @@ def _significant(estimate: Array, covariance: Array) -> Bools:
     Args:
         estimate: Zeros and mounting, (14,), rad.
         covariance: Their covariance, (14, 14), rad^2; 0 for those that are not estimated.
+
+    Returns:
+        Which offsets to correct, (14,).
     """
     kept = np.diag(covariance) > 0.0
     for group in (slice(0, _MOUNTING.start), slice(0, _SENSORS)):
         while kept[group].any():
-            errors = np.sqrt(np.diag(covariance))
             size = np.full(_SENSORS, np.inf)
-            np.divide(np.abs(estimate), errors, out=size, where=kept)
+            size[kept] = np.abs(estimate[kept]) / np.sqrt(np.diag(covariance)[kept])
             least = int(np.argmin(size[group]))
             if size[least] >= SIGNIFICANT_ERRORS:
                 break
@@ -291,7 +301,7 @@ class _Swing:
                 noise[joint] = max(noise[joint], np.sqrt(np.mean(sums**2 / counts)))
         return noise
 
-    def _torque_change(self, x: Array, parameters: Array | int, torque: Array) -> Array:
+    def _torque_change(self, x: Array, parameters: Indices | int, torque: Array) -> Array:
         """Return the derivative of `_holding` by one parameter, or by several together, (n, 12)."""
         moved = x.copy()
         moved[parameters] += DIFFERENCE_STEP_RAD
@@ -307,7 +317,10 @@ class _Swing:
         q, down = self.motion.q - x[:12], -rotate(_mounting(x), self.motion.up)
         legs = (slice(3 * leg, 3 * leg + 3) for leg in range(4))
         return np.hstack(
-            [leg_torque(self.robot, i, q[:, own], dq[:, own], ddq[:, own], down) for i, own in enumerate(legs)]
+            [
+                leg_torque(self.robot, i, q[:, own], dq[:, own], ddq[:, own], down)
+                for i, own in enumerate(legs)
+            ]
         )
 
 
