@@ -19,7 +19,6 @@ from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.state import RobotState
 from quadvel_driver.find_calibration import (
-    SIGNIFICANT_ERRORS,
     CalibrationDataError,
     CalibrationFit,
     Samples,
@@ -64,7 +63,7 @@ def calibrate_command(
 ) -> None:
     """Estimate the zero offsets of encoders and IMU; the driver applies them.
 
-    The file corrects what is larger than three standard errors, and leaves the rest.
+    The file corrects what is significant, and leaves the rest.
 
     \b
     Suspend the robot, and let nothing else send low_cmd:
@@ -124,14 +123,14 @@ def _findings(found: CalibrationFit, has_stood: bool) -> Iterator[str]:
     if written.imu_mounting.any():
         roll, pitch = np.degrees(written.imu_mounting)
         yield f"IMU: tilted by {roll:+.2f} degrees to the right and {pitch:+.2f} degrees forward"
-    if not (written.joint_zeros.any() or written.imu_mounting.any()):
-        yield (
-            f"Nothing to correct: no offset exceeds {SIGNIFICANT_ERRORS:g} standard errors. The file holds zeros."
-        )
+    if not np.isnan(found.zero_errors).any() and not written.joint_zeros.any():
+        yield "Joints: chance explains all estimates; the file leaves the encoders as they are"
+    if not written.imu_mounting.any():
+        yield "IMU: no significant tilt; the file leaves it as it is"
     if not has_stood:
         yield (
-            "A leaning IMU resembles four hips or four thighs that are off: record the standing robot, too, "
-            "and name it with --standing."
+            "A leaning IMU resembles four hips that are off: "
+            "record the standing robot, too, and name it with --standing"
         )
 
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import attrs
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
+from scipy.stats import chi2
 
 from quadvel_description.arrays import Array, Bools, Indices
 from quadvel_description.kinematics import foot_positions, rotate, rotate_inverse
@@ -25,13 +26,12 @@ from .calibration import Calibration, CalibrationError
 from .calibration_samples import BLOCK_S, UP, CalibrationDataError, Motion, Samples
 from .leg_dynamics import leg_torque
 
-__all__ = ["SIGNIFICANT_ERRORS", "CalibrationDataError", "CalibrationFit", "Samples", "fit_calibration"]
+__all__ = ["CalibrationDataError", "CalibrationFit", "Samples", "fit_calibration"]
 
+MAX_CHANCE = 0.001
+"""Zeros are significant together if encoders that are right show as large ones with less probability."""
 SIGNIFICANT_ERRORS = 3.0
-"""Standard errors from which on an offset is significant.
-
-With two, chance would exceed them in one of fourteen offsets on every second sound robot.
-"""
+"""Standard errors from which on a tilt of the IMU is significant."""
 TORQUE_NOISE_NM = 0.05
 """Standard deviation of a mean torque before the residuals are known, N m."""
 CORRELATION_SPANS_S = (BLOCK_S, 0.1, 0.5, 1.0, 2.0)
@@ -77,8 +77,8 @@ class CalibrationFit:
         estimate: All offsets as estimated.
         zero_errors: Standard errors of the joint zeros, (12,), rad; NaN if they were not estimated.
         mounting_errors: Standard errors of the IMU's tilt, (2,), rad.
-        calibration: The correction to apply: offsets of at least SIGNIFICANT_ERRORS standard errors,
-            estimated with all others at zero.
+        calibration: The correction to apply, which leaves what is not significant: all of `estimate` if
+            the zeros together are significant; else the IMU's tilt for encoders that are right.
         unevenness: Largest distance of a foot from the plane of the feet, m; NaN without a standing
             record.
     """
@@ -105,47 +105,36 @@ def fit_calibration(robot: Robot, suspended: Samples | None, standing: Samples |
         CalibrationDataError: A joint does not move in both directions, or a standing robot moves.
     """
     problem = _Problem.from_records(robot, suspended, standing)
-    free = np.full(_SENSORS, True)
-    if suspended is None:
-        free[:12] = False
+    free = np.arange(_SENSORS) >= (12 if suspended is None else 0)
     estimate, covariance = problem.solve(free)
-    kept, _ = problem.solve(_significant(estimate, covariance))
-    calibration, errors = _as_calibration(kept), np.sqrt(np.diag(covariance))
+    calibration = _as_calibration(_significant(problem, estimate, covariance))
+    errors = np.where(free, np.sqrt(np.diag(covariance)), np.nan)
     return CalibrationFit(
         estimate=_as_calibration(estimate),
-        zero_errors=np.where(free, errors, np.nan)[:12],
+        zero_errors=errors[:12],
         mounting_errors=errors[_MOUNTING],
         calibration=calibration,
         unevenness=float("nan") if problem.stand is None else problem.stand.unevenness(calibration),
     )
 
 
-def _significant(estimate: Array, covariance: Array) -> Bools:
-    """Return which of zeros and mounting (14,) are significant, each while the others are.
+def _significant(problem: _Problem, estimate: Array, covariance: Array) -> Array:
+    """Return the zeros and the mounting to correct, (14,), rad.
 
-    The least significant offset is set to zero, one after the other, and the rest is estimated anew.
-    Zeros go first: what a tilted IMU explains, which the standing robot shows, is no fault of encoders.
+    The zeros are tested together (Wald). Significant ones are all corrected: their errors depend on
+    each other, and a hip that is left off would shift the other three. Otherwise the encoders count
+    as right, and the IMU is estimated anew.
 
     Args:
-        estimate: Zeros and mounting, (14,), rad.
+        problem: The records.
+        estimate: All zeros and the mounting, (14,), rad.
         covariance: Their covariance, (14, 14), rad^2; 0 for those that are not estimated.
-
-    Returns:
-        Which offsets to correct, (14,).
     """
-    kept = np.diag(covariance) > 0.0
-    for group in (slice(0, _MOUNTING.start), slice(0, _SENSORS)):
-        while kept[group].any():
-            size = np.full(_SENSORS, np.inf)
-            size[kept] = np.abs(estimate[kept]) / np.sqrt(np.diag(covariance)[kept])
-            least = int(np.argmin(size[group]))
-            if size[least] >= SIGNIFICANT_ERRORS:
-                break
-            gain = covariance[:, least] / covariance[least, least]
-            estimate = estimate - gain * estimate[least]
-            covariance = covariance - np.outer(gain, covariance[least])
-            kept[least] = False
-    return kept
+    zeros, spread = estimate[:12], covariance[:12, :12]
+    if spread.any() and zeros @ np.linalg.solve(spread, zeros) > chi2.isf(MAX_CHANCE, 12):
+        return estimate
+    mounting, covariance = problem.solve(np.arange(_SENSORS) >= 12)
+    return np.where(np.abs(mounting) >= SIGNIFICANT_ERRORS * np.sqrt(np.diag(covariance)), mounting, 0.0)
 
 
 def _as_calibration(sensors: Array) -> Calibration:
