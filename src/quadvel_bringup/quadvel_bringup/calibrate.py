@@ -67,6 +67,7 @@ def calibrate_command(
 
     \b
     Suspend the robot, and let nothing else send low_cmd:
+      quadvel run driver --ros-args -p state_rate:=1000
       quadvel excite creep --seconds 60 --low-level external --out suspended.mcap
     Then let the robot stand on a level floor:
       quadvel record low_state --seconds 5 --out standing.mcap
