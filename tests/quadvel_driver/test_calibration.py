@@ -101,9 +101,11 @@ def test_the_torque_of_a_moving_leg_is_that_of_the_simulator() -> None:
     mujoco.mj_forward(model, data)
     inertia = np.zeros(18)
     mujoco.mj_mulM(model, data, inertia, np.append(np.zeros(6), ddq))
-    moving = [values.reshape(4, 1, 3) for values in (q, dq, ddq)]
+    angles, speeds, accelerations = (values.reshape(4, 1, 3) for values in (q, dq, ddq))
     down = np.array([[0.0, 0.0, -1.0]])
-    torque = np.ravel([leg_torque(ALIENGO, leg, *(each[leg] for each in moving), down) for leg in range(4)])
+    torque = np.ravel(
+        [leg_torque(ALIENGO, leg, angles[leg], speeds[leg], accelerations[leg], down) for leg in range(4)]
+    )
     np.testing.assert_allclose(torque, (data.qfrc_bias + inertia)[6:], atol=1e-9)
 
 

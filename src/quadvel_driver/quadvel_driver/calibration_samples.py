@@ -149,11 +149,9 @@ class Motion:
             )
         ddq = (dq[2:] - dq[:-2]) / (time[2:] - time[:-2])[:, None]
         steady = _is_steady(dq)[1:-1]
-        smooth = (_simpson(values)[whole] for values in (q, dq))
-        q, dq = smooth
-        up = _simpson(up)[whole]
+        q, dq, tau, up = (_simpson(values)[whole] for values in (q, dq, tau, up))
         up = up / np.linalg.norm(up, axis=1, keepdims=True)
-        return cls(time[1:-1][whole], q, dq, ddq[whole], _simpson(tau)[whole], up, steady[whole])
+        return cls(time[1:-1][whole], q, dq, ddq[whole], tau, up, steady[whole])
 
 
 def _averages(time: Array, *columns: Array) -> list[Array]:
