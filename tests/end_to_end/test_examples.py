@@ -105,8 +105,8 @@ LEFT_OUT = {
     "tests/quadvel_follow takes them where they are",
     "quadvel up --world campus": "as with --terrain",
     'quadvel run board --ros-args -p hung:=true -p imu_mounting:="[0.03, 0.0]"': "as the next",
-    "quadvel run driver --ros-args -p board_address:=127.0.0.1 -p local_port:=0": "tests/end_to_end/test_board.py "
-    "walks behind board and driver; tests/quadvel_bringup/test_calibrate.py calibrates",
+    "quadvel run driver --ros-args -p board_address:=127.0.0.1 -p local_port:=0 -p state_rate:=1000": ""
+    "tests/end_to_end/test_board.py walks behind board and driver; tests/quadvel_bringup/test_calibrate.py calibrates",
     "quadvel up --params stamped.yaml": "as the other ups; test_yaml_examples.py loads the file",
     "quadvel demo follow --view": "the same page; tests/end_to_end/test_follow_demo.py runs the demo",
     "quadvel up --view": "tests/quadvel_view/test_page.py opens its page",
@@ -139,7 +139,8 @@ LEFT_OUT = {
     "quadvel up --low-level board": "a board waits for nobody; tests/end_to_end/test_board.py, on a machine with time to spare",
     "quadvel record low_state --seconds 5 --out standing.mcap": "as the other recordings",
     "quadvel up --low-level driver": "needs the robot",
-    "quadvel run driver": "the same",
+    "quadvel run driver --ros-args -p state_rate:=1000": "the same",
+    "quadvel up --low-level board --params imu.yaml": "as the board without; test_yaml_examples.py loads the file",
     "quadvel run driver --ros-args -p calibration:=calibration.yaml": "the same",
     "quadvel run board --ros-args -p robot:=go2 -p state_rate:=500 -p hung:=true": "all of this machine share DDS domain 1; "
     "tests/end_to_end/test_go2_nodes.py runs both in a domain of its own",
@@ -182,8 +183,8 @@ LEFT_OUT_KINDS = {
     r"quadvel policy import .*|python -m benchmarks\.imported_walk .*": "test_imported.py has policies",
     r"pixi run .*": "needs pixi and the network",
     r"mkdir -p out/checkpoints .*": "takes a checkpoint out of the history",
-    r"((driver|controller|command_mux|ros__parameters):|(stick_velocity|max_tilt|max_velocity|stamped): .*)": "a part "
-    "of a parameter file; test_yaml_examples.py loads it",
+    r"(board|driver|controller|command_mux|ros__parameters):": "a part of a parameter file; test_yaml_examples.py loads it",
+    r"(stick_velocity|max_tilt|max_velocity|stamped|imu_mounting): .*": "the same",
     r"\[project\.entry-points\..*|magnetic_drag = .*": "a part of another package's pyproject.toml; tests/quadvel_sysid has one",
     r"(t|q|dq|tau|kp|q_des|t_cmd|q_des_cmd|joint_names): .*": "a part of a map file for --columns",
 }

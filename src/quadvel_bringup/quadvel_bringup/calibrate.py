@@ -18,7 +18,12 @@ from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.state import RobotState
-from quadvel_driver.find_calibration import CalibrationDataError, CalibrationFit, Samples, fit_calibration
+from quadvel_driver.find_calibration import (
+    CalibrationDataError,
+    CalibrationFit,
+    Samples,
+    fit_calibration,
+)
 from quadvel_nodes.messages import read_low_state
 from quadvel_recordings.output import atomic_write, output_file
 from quadvel_recordings.reading import read_messages
@@ -58,8 +63,11 @@ def calibrate_command(
 ) -> None:
     """Estimate the zero offsets of encoders and IMU; the driver applies them.
 
+    The file corrects what is significant, and leaves the rest.
+
     \b
     Suspend the robot, and let nothing else send low_cmd:
+      quadvel run driver --ros-args -p state_rate:=1000
       quadvel excite creep --seconds 60 --low-level external --out suspended.mcap
     Then let the robot stand on a level floor:
       quadvel record low_state --seconds 5 --out standing.mcap
@@ -74,12 +82,8 @@ def calibrate_command(
     found = fit_calibration(chosen, _samples(suspended), _samples(standing))
     console = Console(soft_wrap=True)
     console.print(_table(found))
-    if standing is not None:
-        roll, pitch = np.degrees(found.calibration.imu_mounting)
-        console.print(
-            f"IMU: tilted by {roll:+.2f} degrees to the right and {pitch:+.2f} degrees forward",
-            highlight=False,
-        )
+    for sentence in _findings(found, standing is not None):
+        console.print(sentence, highlight=False)
     if found.unevenness > MAX_UNEVENNESS_M:
         uneven = f"{1e3 * found.unevenness:.0f} mm"
         console.print(
@@ -114,10 +118,38 @@ def _trimmed(states: list[RobotState]) -> list[RobotState]:
     return [state for state in states if begin <= state.time <= end]
 
 
+def _findings(found: CalibrationFit, has_stood: bool) -> Iterator[str]:
+    """Yield sentences on the IMU, and on what the file corrects."""
+    written = found.calibration
+    if written.imu_mounting.any():
+        roll, pitch = np.degrees(written.imu_mounting)
+        yield f"IMU: tilted by {roll:+.2f} degrees to the right and {pitch:+.2f} degrees forward"
+    if not np.isnan(found.zero_errors).any() and not written.joint_zeros.any():
+        yield "Joints: chance explains all estimates; the file leaves the encoders as they are"
+    if not written.imu_mounting.any():
+        yield "IMU: no significant tilt; the file leaves it as it is"
+    if not has_stood:
+        yield (
+            "A leaning IMU resembles four hips that are off: "
+            "record the standing robot, too, and name it with --standing"
+        )
+
+
 def _table(found: CalibrationFit) -> Table:
-    """Return a table of the joint zeros."""
-    table = Table("joint", "shows at zero, degrees", "standard error", title="Joints")
-    zeros = np.degrees(found.calibration.joint_zeros)
-    for name, zero, error in zip(JOINT_NAMES, zeros, np.degrees(found.zero_errors), strict=True):
-        table.add_row(name, f"{zero:+.2f}", "not estimated" if np.isnan(error) else f"{error:.2f}")
+    """Return a table of all offsets: estimated, standard error, and what the file corrects."""
+    table = Table(
+        "offset", "estimate, degrees", "standard error", "written", title="What encoders and IMU show at zero"
+    )
+    names = (*JOINT_NAMES, "IMU roll", "IMU pitch")
+    columns = (
+        np.degrees(np.concatenate(pair))
+        for pair in (
+            (found.estimate.joint_zeros, found.estimate.imu_mounting),
+            (found.zero_errors, found.mounting_errors),
+            (found.calibration.joint_zeros, found.calibration.imu_mounting),
+        )
+    )
+    for name, offset, error, written in zip(names, *columns, strict=True):
+        shown = ("not estimated", "") if np.isnan(error) else (f"{offset:+.2f}", f"{error:.2f}")
+        table.add_row(name, *shown, f"{written:+.2f}" if written else "0")
     return table

@@ -1,45 +1,72 @@
 """Calibration of encoder zeros and IMU tilt from a suspended and a standing robot.
 
-Suspended robot, joints moving slowly to and fro: the torque that holds a leg against gravity is a
-known function of the joint angles, so the measured torques determine the encoder zeros. Friction
-changes its sign with the direction of motion and is fitted, too.
+Suspended robot, joints moving slowly to and fro: the torque that moves a leg against gravity and
+inertia is a known function of the joint angles, so the measured torques determine the encoder
+zeros. Friction changes its sign with the direction of motion and is fitted, too.
 
-Standing robot on a level floor: the four feet give the vertical in the trunk frame, and the IMU
-gives its own vertical. The gravity model needs the IMU, and the feet need the zeros, so both fits
-alternate until they agree. A rotation of the IMU about the vertical axis is not observable.
+Standing robot on a level floor: the four feet are equally high, and the IMU gives the vertical.
+
+One least-squares problem holds both, so that the standard errors contain what the records cannot
+tell apart: equal offsets of four hips resemble a tilted IMU. A rotation of the IMU about the
+vertical axis is not observable.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import attrs
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
+from scipy.stats import chi2
 
-from quadvel_description.arrays import Array, Bools
+from quadvel_description.arrays import Array, Bools, Indices
 from quadvel_description.kinematics import foot_positions, rotate, rotate_inverse
-from quadvel_description.quadruped import GRAVITY, JOINT_NAMES, KINDS, LEGS
 from quadvel_description.robot import Robot
-from quadvel_description.state import RobotState
 
-from .calibration import Calibration
+from .calibration import Calibration, CalibrationError
+from .calibration_samples import BLOCK_S, UP, CalibrationDataError, Motion, Samples
+from .leg_dynamics import leg_torque
 
-MIN_MOVING_SPEED = 0.05  # rad/s, above which friction opposes the motion
-MAX_STANDING_SPEED = 0.1  # rad/s, largest joint speed of a robot that stands still
-MAX_ROWS = 10000  # states of a suspended robot that are used
-MIN_ROWS = 100  # states needed of either record
-ALTERNATIONS = 6  # equal offsets of four hips resemble a tilted IMU, so the fits converge slowly
-TORQUE_NOISE_NM = 0.25  # standard deviation of a measured torque
-ZERO_PRIOR_RAD = 0.035  # (2 deg), prior standard deviation of an encoder zero
-TORQUE_SCALE_PRIOR = 0.1  # prior standard deviation of the scale of measured torques
-ZERO_STEP_RAD = 1e-6  # step of differences by encoder zeros
-REVERSAL_MARGIN = 30  # states around a reversal to leave out: the joint accelerates there
-UP = np.array([0.0, 0.0, 1.0])
+__all__ = ["CalibrationDataError", "CalibrationFit", "Samples", "fit_calibration"]
 
-
-class CalibrationDataError(ValueError):
-    """A recording cannot be used for calibration; the text is the reason, in one sentence."""
+MAX_CHANCE = 0.001
+"""Zeros are significant together if encoders that are right show as large ones with less probability."""
+SIGNIFICANT_ERRORS = 3.0
+"""Standard errors from which on a tilt of the IMU is significant."""
+TORQUE_NOISE_NM = 0.05
+"""Standard deviation of a mean torque before the residuals are known, N m."""
+CORRELATION_SPANS_S = (BLOCK_S, 0.1, 0.5, 1.0, 2.0)
+"""Spans over which residuals are averaged, s: the means of correlated ones scatter more."""
+ZERO_PRIOR_RAD = 0.035
+"""Prior standard deviation of an encoder zero, rad (2 deg)."""
+MOUNTING_PRIOR_RAD = 0.05
+"""Prior standard deviation of the IMU's tilt, rad (3 deg)."""
+TORQUE_SCALE_PRIOR = 0.1
+"""Prior standard deviation of the scale of measured torques."""
+TORQUE_OFFSET_PRIOR_NM = 0.02
+"""Prior standard deviation of the offset of measured torques, N m: it resembles an encoder's."""
+FRICTION_PRIOR = 10.0
+"""Prior standard deviation of Coulomb (N m) and viscous (N m s/rad) friction: they are free."""
+MIN_TORQUE_NOISE_NM = 0.005
+"""Least standard deviation of a mean torque, N m."""
+FOOT_HEIGHT_NOISE_M = 0.001
+"""Standard deviation of the height of a standing foot, m: floor, and rubber of the foot."""
+DIFFERENCE_STEP_RAD = 1e-6
+"""Step of differences by angles, rad."""
+_MOUNTING = slice(12, 14)  # parameters: zeros, mounting, then those of the torques
+_SENSORS = 14
+_TORQUE_KINDS = 4  # scale, Coulomb friction, viscous friction and offset of each joint
+_SIZE = _SENSORS + 12 * _TORQUE_KINDS
+_PRIOR_DEVIATIONS = np.repeat(
+    [
+        ZERO_PRIOR_RAD,
+        MOUNTING_PRIOR_RAD,
+        TORQUE_SCALE_PRIOR,
+        FRICTION_PRIOR,
+        FRICTION_PRIOR,
+        TORQUE_OFFSET_PRIOR_NM,
+    ],
+    [12, 2, 12, 12, 12, 12],
+)
 
 
 @attrs.frozen(eq=False)
@@ -47,54 +74,24 @@ class CalibrationFit:
     """Result of a calibration.
 
     Attributes:
-        calibration: The calibration.
-        zero_errors: Standard errors of the joint zeros, (12,), rad; NaN if they were not fitted.
+        estimate: All offsets as estimated.
+        zero_errors: Standard errors of the joint zeros, (12,), rad; NaN if they were not estimated.
+        mounting_errors: Standard errors of the IMU's tilt, (2,), rad.
+        calibration: The correction to apply, which leaves what is not significant: all of `estimate` if
+            the zeros together are significant; else the IMU's tilt for encoders that are right.
         unevenness: Largest distance of a foot from the plane of the feet, m; NaN without a standing
             record.
     """
 
-    calibration: Calibration
+    estimate: Calibration
     zero_errors: Array
+    mounting_errors: Array
+    calibration: Calibration
     unevenness: float
 
 
-@attrs.frozen(eq=False)
-class Samples:
-    """States as arrays.
-
-    Attributes:
-        q: Joint angles, (n, 12), rad.
-        dq: Joint speeds, (n, 12), rad/s.
-        tau: Joint torques, (n, 12), N m.
-        quaternion: Orientation (w, x, y, z), (n, 4).
-    """
-
-    q: Array
-    dq: Array
-    tau: Array
-    quaternion: Array
-
-    @classmethod
-    def from_states(cls, states: Iterable[RobotState]) -> Samples:
-        """Collect states.
-
-        Args:
-            states: Measured states.
-
-        Returns:
-            Their arrays.
-
-        Raises:
-            CalibrationDataError: There are fewer than MIN_ROWS states.
-        """
-        rows = [(state.q, state.dq, state.tau, state.quaternion) for state in states]
-        if len(rows) < MIN_ROWS:
-            raise CalibrationDataError(f"{len(rows)} states, expected {MIN_ROWS} at least")
-        return cls(*(np.array(column) for column in zip(*rows, strict=True)))
-
-
 def fit_calibration(robot: Robot, suspended: Samples | None, standing: Samples | None) -> CalibrationFit:
-    """Fit the calibration to the records; parameters without a record keep zero offset.
+    """Fit the calibration to the records; without a suspended one the encoders count as right.
 
     Args:
         robot: The robot.
@@ -107,214 +104,266 @@ def fit_calibration(robot: Robot, suspended: Samples | None, standing: Samples |
     Raises:
         CalibrationDataError: A joint does not move in both directions, or a standing robot moves.
     """
-    calibration, errors, unevenness = Calibration(), np.full(12, np.nan), float("nan")
-    if suspended is not None:
-        _check_suspended(suspended)
-    if standing is not None:
-        _check_standing(standing)
-    for _ in range(ALTERNATIONS):
-        if standing is not None:
-            mounting, unevenness = _imu_mounting(robot, standing, calibration)
-            calibration = attrs.evolve(calibration, imu_mounting=mounting)
-        if suspended is not None:
-            zeros, errors = _joint_zeros(robot, suspended, calibration)
-            calibration = attrs.evolve(calibration, joint_zeros=zeros)
-    return CalibrationFit(calibration, errors, unevenness)
+    problem = _Problem.from_records(robot, suspended, standing)
+    free = np.arange(_SENSORS) >= (12 if suspended is None else 0)
+    estimate, covariance = problem.solve(free)
+    calibration = _as_calibration(_significant(problem, estimate, covariance))
+    errors = np.where(free, np.sqrt(np.diag(covariance)), np.nan)
+    return CalibrationFit(
+        estimate=_as_calibration(estimate),
+        zero_errors=errors[:12],
+        mounting_errors=errors[_MOUNTING],
+        calibration=calibration,
+        unevenness=float("nan") if problem.stand is None else problem.stand.unevenness(calibration),
+    )
 
 
-def holding_torque(robot: Robot, q: Array, down: Array) -> Array:
-    """Compute the joint torques that hold legs in the air against gravity.
+def _significant(problem: _Problem, estimate: Array, covariance: Array) -> Array:
+    """Return the zeros and the mounting to correct, (14,), rad.
 
-        tau_j = -a_j . sum over bodies b beyond j of (c_b - p_j) x (m_b g e_down)
-
-    with joint axis a_j, joint position p_j, and centre of mass c_b.
+    The zeros are tested together (Wald). Significant ones are all corrected: their errors depend on
+    each other, and a hip that is left off would shift the other three. Otherwise the encoders count
+    as right, and the IMU is estimated anew.
 
     Args:
-        robot: The robot.
-        q: Joint angles, (n, 12), rad.
-        down: Direction of gravity in the trunk frame, unit vectors, (n, 3).
-
-    Returns:
-        Torques, (n, 12), N m.
+        problem: The records.
+        estimate: All zeros and the mounting, (14,), rad.
+        covariance: Their covariance, (14, 14), rad^2; 0 for those that are not estimated.
     """
-    return np.hstack([_leg_torque(robot, q[:, 3 * leg : 3 * leg + 3], down, leg) for leg in range(4)])
+    zeros, spread = estimate[:12], covariance[:12, :12]
+    if spread.any() and zeros @ np.linalg.solve(spread, zeros) > chi2.isf(MAX_CHANCE, 12):
+        return estimate
+    mounting, covariance = problem.solve(np.arange(_SENSORS) >= 12)
+    return np.where(np.abs(mounting) >= SIGNIFICANT_ERRORS * np.sqrt(np.diag(covariance)), mounting, 0.0)
 
 
-def _leg_torque(robot: Robot, q: Array, down: Array, leg: int) -> Array:
-    """Return the holding torque of one leg, (n, 3), N m."""
-    (joints, centres), axes, masses = _leg_masses(robot, q, LEGS[leg])
-    torque = np.zeros_like(q)
-    for joint in range(3):
-        for body in range(joint, 3):
-            moment = np.cross(centres[body] - joints[joint], masses[body] * GRAVITY * down)
-            torque[:, joint] -= (axes[joint] * moment).sum(axis=1)
-    return torque
-
-
-def _leg_masses(
-    robot: Robot, q: Array, leg: str
-) -> tuple[tuple[list[Array], list[Array]], list[Array], list[float]]:
-    """Return joint positions and centres of mass (n, 3) m, joint axes (n, 3) and masses (kg) of a leg, trunk frame."""
-    position, rotation = np.zeros((len(q), 3)), np.broadcast_to(np.eye(3), (len(q), 3, 3))
-    joints, centres, axes, masses = [], [], [], []
-    for k, kind in enumerate(KINDS):
-        link = next(link for link in robot.links if link.name == f"{leg}_{kind}")
-        body = robot.combined_inertial(link.name)
-        position = position + rotation @ np.array(link.origin)
-        rotation = rotation @ _rotation_about(q[:, k], 0 if link.axis == "x" else 1)
-        joints.append(position)
-        axes.append(rotation[:, :, 0 if link.axis == "x" else 1])
-        centres.append(position + rotation @ np.array(body.com))
-        masses.append(float(body.mass))
-    return (joints, centres), axes, masses
-
-
-def _rotation_about(angle: Array, axis: int) -> Array:
-    """Return the rotation matrices (n, 3, 3) about x (0) or y (1)."""
-    matrices = np.zeros((len(angle), 3, 3))
-    a, b = [i for i in range(3) if i != axis]
-    sign = 1.0 if axis == 0 else -1.0
-    matrices[:, axis, axis] = 1.0
-    matrices[:, a, a] = matrices[:, b, b] = np.cos(angle)
-    matrices[:, b, a], matrices[:, a, b] = sign * np.sin(angle), -sign * np.sin(angle)
-    return matrices
-
-
-def _joint_zeros(robot: Robot, suspended: Samples, calibration: Calibration) -> tuple[Array, Array]:
-    """Return the encoder zeros and their standard errors, (12,) rad each, for the IMU tilt of `calibration`."""
-    down = rotate(calibration.mounting, rotate_inverse(suspended.quaternion, -UP))
-    legs = [_leg_zeros(robot, suspended, down, leg, calibration.joint_zeros) for leg in range(4)]
-    zeros, errors = np.array(legs).transpose(1, 0, 2).reshape(2, 12)
-    return zeros, errors
-
-
-def _leg_zeros(robot: Robot, suspended: Samples, down: Array, leg: int, start: Array) -> tuple[Array, Array]:
-    """Return zeros and standard errors of one leg, (3,) rad each.
-
-    The covariance of the fit is s^2 (J^T J)^-1 with the residual variance s^2, at least 1.
-
-    Args:
-        robot: The robot.
-        suspended: States of a suspended robot.
-        down: Direction of gravity in the trunk frame, (n, 3).
-        leg: Index of the leg.
-        start: Initial zeros, (12,), rad.
-    """
-    joints = slice(3 * leg, 3 * leg + 3)
-    steady = np.flatnonzero(_is_steady(suspended.dq[:, joints]))
-    rows = steady[:: max(1, len(steady) // MAX_ROWS)]
-    problem = _LegProblem(
-        robot,
-        leg,
-        q=suspended.q[rows, joints],
-        dq=suspended.dq[rows, joints],
-        tau=suspended.tau[rows, joints],
-        down=down[rows],
-    )
-    guess = np.concatenate(
-        [start[joints], np.ones(3), robot.joint_friction[joints], robot.joint_damping[joints]]
-    )
-    scale = np.repeat([0.1, 0.1, 0.5, 0.5], 3)
-    fit = least_squares(problem.residuals, guess, problem.jacobian, x_scale=scale)
-    variance = np.square(fit.fun[:-6]).sum() / (fit.fun.size - 6 - fit.x.size)
-    errors = np.sqrt(max(variance, 1.0) * np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
-    return fit.x[:3], errors[:3]
+def _as_calibration(sensors: Array) -> Calibration:
+    """Return the calibration of zeros and mounting, (14,) rad."""
+    try:
+        return Calibration(sensors[:12], sensors[_MOUNTING])
+    except CalibrationError as error:
+        raise CalibrationDataError(f"{error}; check --robot and the joints") from None
 
 
 @attrs.frozen(eq=False)
-class _LegProblem:
-    """Least squares over the zeros z, torque scales k, Coulomb friction c and viscous friction d of a leg.
+class _Problem:
+    """Least squares over zeros and mounting (14,), and torque parameters (12 * _TORQUE_KINDS,).
 
-        tau = k tau_hold(q - z) + c sign(dq) + d dq
+    Attributes:
+        swing: The suspended record; None if there is none.
+        stand: The standing record; None if there is none.
+    """
 
-    It is weighted by TORQUE_NOISE_NM, with priors k = 1 +- TORQUE_SCALE_PRIOR and z = 0 +-
-    ZERO_PRIOR_RAD. The parameters are (z, k, c, d) of the three joints, (12,).
+    swing: _Swing | None
+    stand: _Stand | None
+
+    @classmethod
+    def from_records(cls, robot: Robot, suspended: Samples | None, standing: Samples | None) -> _Problem:
+        """Check and condense the records."""
+        if suspended is not None:
+            suspended.check_suspended()
+        if standing is not None:
+            standing.check_standing()
+        return cls(
+            None if suspended is None else _Swing.from_samples(robot, suspended),
+            None if standing is None else _Stand.from_samples(robot, standing),
+        )
+
+    def solve(self, free: Bools) -> tuple[Array, Array]:
+        """Return zeros and mounting, (14,) rad, and their covariance; those not free are zero.
+
+        The second fit weights the torques of each joint by the residuals of the first.
+        """
+        noise, refined = np.full(12, TORQUE_NOISE_NM), self
+        if self.swing is not None:
+            first, _ = self._fit(free, noise)
+            noise = self.swing.noise(first)
+            refined = attrs.evolve(self, swing=self.swing.with_inertia(first))
+        x, jacobian = refined._fit(free, noise)
+        covariance = np.zeros((_SENSORS, _SENSORS))
+        covariance[np.ix_(free, free)] = np.linalg.inv(jacobian.T @ jacobian)[: free.sum(), : free.sum()]
+        return x[:_SENSORS], covariance
+
+    def _fit(self, free: Bools, noise: Array) -> tuple[Array, Array]:
+        """Return all parameters (_SIZE,), and the Jacobian of the residuals by the free ones."""
+        columns = np.append(free, np.full(_SIZE - _SENSORS, True))
+        x = _prior_means(self.swing)
+
+        def whole(values: Array) -> Array:
+            x[columns] = values
+            return x
+
+        fit: OptimizeResult = least_squares(
+            lambda values: self._residuals(whole(values), noise),
+            x[columns],
+            lambda values: self._jacobian(whole(values), noise)[:, columns],
+        )
+        return whole(fit.x).copy(), fit.jac
+
+    def _residuals(self, x: Array, noise: Array) -> Array:
+        rows = [(x - _prior_means(self.swing)) / _PRIOR_DEVIATIONS]
+        if self.swing is not None:
+            rows.append((self.swing.residuals(x) / noise)[self.swing.motion.steady])
+        if self.stand is not None:
+            rows.append(self.stand.residuals(x))
+        return np.concatenate(rows)
+
+    def _jacobian(self, x: Array, noise: Array) -> Array:
+        rows = [np.diag(1.0 / _PRIOR_DEVIATIONS)]
+        if self.swing is not None:
+            rows.append((self.swing.jacobian(x) / noise[:, None])[self.swing.motion.steady])
+        if self.stand is not None:
+            rows.append(self.stand.jacobian(x))
+        return np.vstack(rows)
+
+
+@attrs.frozen(eq=False)
+class _Swing:
+    """Torques of a suspended robot.
+
+        tau = k tau_hold(q - z) + tau_inertia + c sign(dq) + d dq + b
+
+    The parameters are zeros z (12,) and mounting (2,), then k, c, d and b of each joint. The fit leaves
+    tau_inertia as it is: noise of the accelerations would make k, and with it z, too small.
 
     Attributes:
         robot: The robot.
-        leg: Index of the leg.
-        q: Joint angles, (n, 3), rad.
-        dq: Joint speeds, (n, 3), rad/s.
-        tau: Joint torques, (n, 3), N m.
-        down: Direction of gravity in the trunk frame, (n, 3).
+        motion: Its motion.
+        inertia: Torques tau_inertia that accelerate the legs, (n, 12), N m.
     """
 
     robot: Robot
-    leg: int
-    q: Array
-    dq: Array
-    tau: Array
-    down: Array
+    motion: Motion
+    inertia: Array
+
+    @classmethod
+    def from_samples(cls, robot: Robot, suspended: Samples) -> _Swing:
+        """Average the states; the inertia is that of encoders and torques that are right."""
+        motion = Motion.from_samples(suspended)
+        bare = cls(robot, motion, np.zeros_like(motion.q))
+        return bare.with_inertia(_prior_means(bare))
+
+    def with_inertia(self, x: Array) -> _Swing:
+        """Return the same with the inertia for given parameters."""
+        motion, scale = self.motion, x[_SENSORS : _SENSORS + 12]
+        moving = self._torque(x, motion.dq, motion.ddq) - self._holding(x)
+        return attrs.evolve(self, inertia=scale * moving)
 
     def residuals(self, x: Array) -> Array:
-        """Return the weighted residuals of the torques and of the priors of k and z, (3 n + 6,)."""
-        zeros, scale, dry, viscous = x.reshape(4, 3)
-        model = scale * self._holding(zeros) + dry * np.sign(self.dq) + viscous * self.dq
-        priors = (scale - 1.0) / TORQUE_SCALE_PRIOR, zeros / ZERO_PRIOR_RAD
-        return np.concatenate([((self.tau - model) / TORQUE_NOISE_NM).ravel(), *priors])
+        """Return measured less modelled torques, (n, 12), N m."""
+        scale, dry, viscous, offset = x[_SENSORS:].reshape(_TORQUE_KINDS, 12)
+        motion = self.motion
+        friction = dry * np.sign(motion.dq) + viscous * motion.dq
+        return motion.tau - scale * self._holding(x) - self.inertia - friction - offset
 
     def jacobian(self, x: Array) -> Array:
-        """Return the derivatives of the residuals, (3 n + 6, 12); those by z from differences."""
-        zeros, scale, _, _ = x.reshape(4, 3)
-        model = np.zeros((len(self.q), 3, 4, 3))  # d tau_joint / d (kind of parameter, of joint)
-        holding, own = self._holding(zeros), np.arange(3)
-        for joint, step in enumerate(ZERO_STEP_RAD * np.eye(3)):
-            model[:, :, 0, joint] = scale * (self._holding(zeros + step) - holding) / ZERO_STEP_RAD
-        for kind, slope in enumerate((holding, np.sign(self.dq), self.dq), 1):
-            model[:, own, kind, own] = slope
-        priors = np.zeros((2, 3, 4, 3))
-        priors[0, own, 1, own], priors[1, own, 0, own] = 1.0 / TORQUE_SCALE_PRIOR, 1.0 / ZERO_PRIOR_RAD
-        return np.vstack([-model.reshape(-1, 12) / TORQUE_NOISE_NM, priors.reshape(-1, 12)])
+        """Return the derivatives of the residuals, (n, 12, _SIZE); those by angles from differences."""
+        motion, own = self.motion, np.arange(12)
+        scale, torque = x[_SENSORS : _SENSORS + 12], self._holding(x)
+        slopes = np.zeros((len(torque), 12, _SIZE))
+        for k in range(3):  # the same joint of all legs at once: no leg's torque depends on another's zeros
+            moved = np.flatnonzero(own % 3 == k)
+            change = self._torque_change(x, moved, torque) * scale
+            for joint in moved:
+                leg = slice(joint - k, joint - k + 3)
+                slopes[:, leg, joint] = change[:, leg]
+        for parameter in range(_MOUNTING.start, _MOUNTING.stop):
+            slopes[:, :, parameter] = self._torque_change(x, parameter, torque) * scale
+        by_kind = slopes[:, :, _SENSORS:].reshape(-1, 12, _TORQUE_KINDS, 12)
+        for kind, slope in enumerate((torque, np.sign(motion.dq), motion.dq, np.ones_like(torque))):
+            by_kind[:, own, kind, own] = slope
+        return -slopes
 
-    def _holding(self, zeros: Array) -> Array:
-        return _leg_torque(self.robot, self.q - zeros, self.down, self.leg)
+    def noise(self, x: Array) -> Array:
+        """Return the standard deviation of the joints' torques, (12,), N m, raised to cover their correlation.
 
+        Means of m residuals scatter with sigma / sqrt(m) if they are independent; the largest sigma
+        over CORRELATION_SPANS_S is taken.
+        """
+        residuals, steady = self.residuals(x), self.motion.steady
+        noise = np.full(12, MIN_TORQUE_NOISE_NM)
+        for joint in range(12):
+            mine, times = residuals[steady[:, joint], joint], self.motion.time[steady[:, joint]]
+            for span in CORRELATION_SPANS_S:
+                group = np.unique(np.floor(times / span), return_inverse=True)[1]
+                sums, counts = np.bincount(group, mine), np.bincount(group)
+                noise[joint] = max(noise[joint], np.sqrt(np.mean(sums**2 / counts)))
+        return noise
 
-def _is_steady(dq: Array) -> Bools:
-    """Return the rows of joint speeds (n, 3) in which all joints move, and none reverses nearby, (n,)."""
-    under_way = np.abs(dq) > MIN_MOVING_SPEED
-    same = np.sign(dq[1:]) == np.sign(dq[:-1])
-    steady: Bools = np.all(under_way, axis=1)
-    steady = np.logical_and(steady, np.append(True, same.all(axis=1)))
-    around = np.convolve(np.logical_not(steady), np.ones(2 * REVERSAL_MARGIN + 1), mode="same")
-    return np.asarray(around < 0.5)
+    def _torque_change(self, x: Array, parameters: Indices | int, torque: Array) -> Array:
+        """Return the derivative of `_holding` by one parameter, or by several together, (n, 12)."""
+        moved = x.copy()
+        moved[parameters] += DIFFERENCE_STEP_RAD
+        return (self._holding(moved) - torque) / DIFFERENCE_STEP_RAD
 
+    def _holding(self, x: Array) -> Array:
+        """Return the torques against gravity for zeros and mounting of x, (n, 12), N m."""
+        rest = np.zeros_like(self.motion.q)
+        return self._torque(x, rest, rest)
 
-def _imu_mounting(robot: Robot, standing: Samples, calibration: Calibration) -> tuple[Array, float]:
-    """Return the tilt of the IMU, (2,) rad, and the largest distance of a foot from their plane, m.
-
-    The tilt is the rotation from the vertical that the IMU shows to the normal of the plane of the
-    feet (the singular vector of the smallest singular value of the centred foot positions).
-    """
-    feet = foot_positions(robot, standing.q - calibration.joint_zeros).mean(axis=0)
-    centred = feet - feet.mean(axis=0)
-    normal = np.linalg.svd(centred)[2][2]
-    normal = normal * np.sign(normal[2])
-    imu_up = rotate_inverse(standing.quaternion, UP).mean(axis=0)
-    imu_up = imu_up / np.linalg.norm(imu_up)
-    rotation = np.cross(imu_up, normal)
-    sine = float(np.linalg.norm(rotation))
-    angle = np.arctan2(sine, imu_up @ normal)
-    return rotation[:2] * (angle / sine if sine > 0.0 else 1.0), float(np.abs(centred @ normal).max())
-
-
-def _check_suspended(suspended: Samples) -> None:
-    """Raise CalibrationDataError if a joint does not move in both directions."""
-    for i, name in enumerate(JOINT_NAMES):
-        moving = suspended.dq[:, i]
-        if min((moving > MIN_MOVING_SPEED).sum(), (moving < -MIN_MOVING_SPEED).sum()) < MIN_ROWS // 2:
-            raise CalibrationDataError(
-                f"{name} hardly moves to and fro; record quadvel excite creep with the robot suspended"
-            )
-
-
-def _check_standing(standing: Samples) -> None:
-    """Raise CalibrationDataError if the robot moves or does not stand on straight enough legs."""
-    speed = float(np.abs(standing.dq.mean(axis=0)).max()), float(np.median(np.abs(standing.dq)))
-    if max(speed) > MAX_STANDING_SPEED:
-        raise CalibrationDataError(
-            f"the joints move at {max(speed):.2f} rad/s, expected a robot that stands still"
+    def _torque(self, x: Array, dq: Array, ddq: Array) -> Array:
+        """Return the torques without friction for zeros and mounting of x, (n, 12), N m."""
+        q, down = self.motion.q - x[:12], -rotate(_mounting(x), self.motion.up)
+        legs = (slice(3 * leg, 3 * leg + 3) for leg in range(4))
+        return np.hstack(
+            [
+                leg_torque(self.robot, i, q[:, own], dq[:, own], ddq[:, own], down)
+                for i, own in enumerate(legs)
+            ]
         )
-    bent = standing.q.mean(axis=0).reshape(4, 3)[:, 2]
-    if (bent < -2.2).any():
-        raise CalibrationDataError(f"a knee is bent by {bent.min():.2f} rad, expected a robot that stands")
+
+
+@attrs.frozen(eq=False)
+class _Stand:
+    """Heights of the feet of a standing robot.
+
+    Attributes:
+        robot: The robot.
+        q: Mean joint angles, (12,), rad.
+        up: Mean vertical in the frame of the IMU, (3,).
+    """
+
+    robot: Robot
+    q: Array
+    up: Array
+
+    @classmethod
+    def from_samples(cls, robot: Robot, standing: Samples) -> _Stand:
+        """Average the states."""
+        up = rotate_inverse(standing.quaternion, UP).mean(axis=0)
+        return cls(robot, standing.q.mean(axis=0), up / np.linalg.norm(up))
+
+    def residuals(self, x: Array) -> Array:
+        """Return the feet's heights above their mean, (4,), in FOOT_HEIGHT_NOISE_M."""
+        height = foot_positions(self.robot, self.q - x[:12]) @ rotate(_mounting(x), self.up)
+        return (height - height.mean()) / FOOT_HEIGHT_NOISE_M
+
+    def jacobian(self, x: Array) -> Array:
+        """Return the derivatives of the residuals, (4, _SIZE), from differences."""
+        slopes, here = np.zeros((4, _SIZE)), self.residuals(x)
+        for parameter in range(_SENSORS):
+            moved = x.copy()
+            moved[parameter] += DIFFERENCE_STEP_RAD
+            slopes[:, parameter] = (self.residuals(moved) - here) / DIFFERENCE_STEP_RAD
+        return slopes
+
+    def unevenness(self, calibration: Calibration) -> float:
+        """Return the largest distance of a foot from the plane of the feet, m."""
+        feet = foot_positions(self.robot, self.q - calibration.joint_zeros)
+        centred = feet - feet.mean(axis=0)
+        return float(np.abs(centred @ np.linalg.svd(centred)[2][2]).max())
+
+
+def _mounting(x: Array) -> Array:
+    """Return the rotation from trunk to IMU as a quaternion (w, x, y, z), (4,)."""
+    return Calibration(imu_mounting=x[_MOUNTING]).mounting
+
+
+def _prior_means(swing: _Swing | None) -> Array:
+    """Return the prior means of all parameters, (_SIZE,)."""
+    x = np.zeros(_SIZE)
+    if swing is not None:
+        x[_SENSORS:] = np.concatenate(
+            [np.ones(12), swing.robot.joint_friction, swing.robot.joint_damping, np.zeros(12)]
+        )
+    return x
