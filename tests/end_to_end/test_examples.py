@@ -49,6 +49,7 @@ class Step:
 ROBOT = [
     Step("quadvel up --terrain rough", served=True, then=READY),
     Step("quadvel status"),
+    Step("quadvel status --joints"),
     Step("quadvel drive --vx 0.5 --wz 0.3 --seconds 5", more="--seconds 1.5"),
     Step("quadvel drive --vx 0.5", more="--seconds 1.5"),
     Step("quadvel push --fy 60"),
@@ -58,6 +59,7 @@ ROBOT = [
     ),
     Step("quadvel record low_state low_cmd --out first.mcap", more="--seconds 0.5"),
     Step("quadvel record low_state low_cmd --out run.mcap", more="--seconds 0.5"),
+    Step("quadvel record low_state low_cmd --out walk.mcap", more="--seconds 0.5 --out helped.mcap"),
     Step("quadvel reset"),
     Step("quadvel reset --terrain slope --slope 0.175"),
     Step("quadvel mode passive"),
@@ -103,6 +105,7 @@ LEFT_OUT = {
     "quadvel following --out out/following": "minutes; tests/quadvel_follow/test_follow_planner.py walks on its stage",
     "quadvel people --scans FOLDER --out out/people": "real scans that are no part of this repository; "
     "tests/quadvel_follow takes them where they are",
+    "quadvel up": "as with --terrain",
     "quadvel up --world campus": "as with --terrain",
     'quadvel run board --ros-args -p hung:=true -p imu_mounting:="[0.03, 0.0]"': "as the next",
     "quadvel run driver --ros-args -p board_address:=127.0.0.1 -p local_port:=0 -p state_rate:=1000": ""

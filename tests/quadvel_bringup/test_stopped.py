@@ -15,7 +15,7 @@ import pytest
 LONG = {
     "demo": ["--lockstep", "--no-video"],
     "demo follow": ["--seconds", "60", "--world", "corridor"],
-    "excite": ["foot-lifting"],
+    "excite": ["creep", "--seconds", "600"],
     "twin": ["dry_gears"],
     "eval": ["--grid", "quick"],
     "faults": ["--seeds", "2"],

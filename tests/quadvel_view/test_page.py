@@ -16,6 +16,7 @@ from io import BytesIO
 from itertools import combinations
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -383,7 +384,8 @@ def test_with_a_token_the_scene_is_drawn_under_each_name_of_this_host(
     browser: Any, walked: Path, tmp_path: Path, name: str
 ) -> None:
     view = Served(tmp_path / "view.log", "view", str(walked), "--port", "0", "--host", "0.0.0.0")
-    url = view.said(r"open (http://0\.0\.0\.0:\d+/\S+)").replace("0.0.0.0", name)
+    printed = urlsplit(view.said(r"open (http://\S+)"))
+    url = printed._replace(netloc=f"{name}:{printed.port}").geturl()
     page = Page(browser, url, 800, 600, scene=True)
     page.page.frame_locator("#scene").locator("canvas").first.wait_for()
     page.until("state.playback.time > 0")

@@ -36,7 +36,12 @@ def test_the_shift_changes_after_some_sequences_and_is_bounded() -> None:
         shift.add(command, 50.0 * command[:, :3])
     assert not shift.of(command).any()
     shift.add(command, 50.0 * command[:, :3])
+    once = np.abs(shift.of(command)).max(axis=0)
+    for _ in range(60):
+        shift.add(command, 50.0 * command[:, :3])
     largest = np.abs(shift.of(command)).max(axis=0)
+    assert (once[:3] > 0.0).all()
+    assert (once[:3] < MAX_SHIFT).all()
     assert largest[:3] == pytest.approx(MAX_SHIFT)
     assert largest[3] == 0.0
 

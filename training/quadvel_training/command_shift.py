@@ -5,10 +5,12 @@ sequences of a third of a second, copies them in part: at 1.5 m/s it is 0.1 m/s 
 is asked for a shifted command. The shift grows by the student's own mean error at each command, as
 in integral control, until there is none. It is a smooth function of the command:
 
-    shift(c) = W phi(c),   W <- W + gain argmin_V sum_i |e_i - V phi(c_i)|^2 + ridge |V|^2
+    shift(c) = W phi(c),   W <- W + gain argmin_V sum_i w_i |e_i - V phi(c_i)|^2 + ridge |V|^2
 
 where e_i is the command minus the velocity of a robot that the student drives, and phi are the
-monomials of vx, vy and yaw rate up to the third degree. The mirrored command gets the mirrored shift.
+monomials of vx, vy and yaw rate up to the third degree. Errors are bounded, so that few robots that
+slip or carry much do not shift all others. Weights w_i fall with the command: at the fastest ones
+robots fall before they are steady. The mirrored command gets the mirrored shift.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from typing import Any
 import numpy as np
 
 SCALES = np.array([2.0, 1.0, 3.0])  # m/s, m/s, rad/s: commands of usual size, so that features are about 1
+MAX_ERROR = np.array([0.1, 0.1, 0.2])  # m/s, m/s, rad/s: larger ones count as this
 MAX_SHIFT = np.array([0.3, 0.3, 0.6])  # m/s, m/s, rad/s
 MIRROR = np.array([1.0, -1.0, -1.0])  # of vx, vy and yaw rate, left for right
 MONOMIALS = [axes for degree in (1, 2, 3) for axes in combinations_with_replacement(range(3), degree)]
@@ -68,10 +71,12 @@ class CommandShift:
             command: (n, 4), commands of walking robots.
             error: (n, 3), command minus velocity in vx, vy (m/s) and yaw rate (rad/s).
         """
+        weight = 1.0 / (1.0 + np.sum((command[:, :3] / SCALES) ** 2, axis=1, keepdims=True))
+        bounded = np.clip(error, -MAX_ERROR, MAX_ERROR)
         for sign in (np.ones(3), MIRROR):
             phi = _features(command[:, :3] * sign)
-            self._squares += phi.T @ phi
-            self._products += phi.T @ (error * sign)
+            self._squares += phi.T @ (weight * phi)
+            self._products += phi.T @ (weight * bounded * sign)
         self._calls += 1
         if self._calls == self.every:
             penalty = RIDGE * np.eye(len(MONOMIALS))

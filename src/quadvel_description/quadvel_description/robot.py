@@ -53,7 +53,7 @@ def load_robot(robot: str) -> Robot:
     if not file.is_file():
         names = ", ".join(shipped_robots())
         raise FileNotFoundError(
-            f"robot: found {robot!r}, expected {names} or the path of a folder or of its robot.yaml"
+            f"robot: found {robot!r}, expected {names} or the path of a robot.yaml or of its folder"
         )
     fields = read_document(file, "a YAML file of a robot", SCHEMA)
     if undecided := [name for name, value in fields.items() if value == UNDECIDED]:
