@@ -14,7 +14,7 @@ from quadvel_description.mjcf import Plant, load_model
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver.calibration import Calibration, CalibrationError
 from quadvel_driver.find_calibration import CalibrationDataError, CalibrationFit, Samples, fit_calibration
-from quadvel_driver.leg_dynamics import holding_torque, leg_torque
+from quadvel_driver.leg_dynamics import leg_torque
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.simulator import Simulator
 from quadvel_sysid.excitation import Creep
@@ -86,9 +86,10 @@ def test_the_holding_torque_is_that_of_the_simulator() -> None:
         data.qpos[3:7], data.qpos[7:], data.qvel[:] = turn / np.linalg.norm(turn), q, 0.0
         mujoco.mj_forward(model, data)
         down = rotate_inverse(data.qpos[3:7], np.array([0.0, 0.0, -1.0]))
-        np.testing.assert_allclose(
-            holding_torque(ALIENGO, q[None], down[None])[0], data.qfrc_bias[6:], atol=1e-9
-        )
+        rest = np.zeros((1, 3))
+        legs = enumerate(q.reshape(4, 1, 3))
+        torque = np.ravel([leg_torque(ALIENGO, leg, angles, rest, rest, down[None]) for leg, angles in legs])
+        np.testing.assert_allclose(torque, data.qfrc_bias[6:], atol=1e-9)
 
 
 def test_the_torque_of_a_moving_leg_is_that_of_the_simulator() -> None:

@@ -13,21 +13,6 @@ from quadvel_description.quadruped import GRAVITY, KINDS, LEGS
 from quadvel_description.robot import Robot
 
 
-def holding_torque(robot: Robot, q: Array, down: Array) -> Array:
-    """Compute the joint torques that hold legs in the air against gravity.
-
-    Args:
-        robot: The robot.
-        q: Joint angles, (n, 12), rad.
-        down: Direction of gravity in the trunk frame, unit vectors, (n, 3).
-
-    Returns:
-        Torques, (n, 12), N m.
-    """
-    legs, rest = np.split(q, 4, axis=1), np.zeros((len(q), 3))
-    return np.hstack([leg_torque(robot, leg, angles, rest, rest, down) for leg, angles in enumerate(legs)])
-
-
 def leg_torque(robot: Robot, leg: int, q: Array, dq: Array, ddq: Array, down: Array) -> Array:
     """Compute the joint torques that move one leg in the air (Newton and Euler).
 
