@@ -9,7 +9,8 @@ in integral control, until there is none. It is a smooth function of the command
 
 where e_i is the command minus the velocity of a robot that the student drives, and phi are the
 monomials of vx, vy and yaw rate up to the third degree. Errors are bounded, so that few robots that
-slip or carry much do not shift all others. Weights w_i fall with the command: at the fastest ones
+slip or carry much do not shift all others. All processes of a run share the shift.
+Weights w_i fall with the command: at the fastest ones
 robots fall before they are steady. The mirrored command gets the mirrored shift.
 """
 
@@ -19,6 +20,9 @@ from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
+import torch
+
+from . import process_group
 
 SCALES = np.array([2.0, 1.0, 3.0])  # m/s, m/s, rad/s: commands of usual size, so that features are about 1
 MAX_ERROR = np.array([0.1, 0.1, 0.2])  # m/s, m/s, rad/s: larger ones count as this
@@ -78,9 +82,11 @@ class CommandShift:
             self._squares += phi.T @ (weight * phi)
             self._products += phi.T @ (weight * bounded * sign)
         self._calls += 1
-        if self._calls == self.every:
-            penalty = RIDGE * np.eye(len(MONOMIALS))
-            self._weights += GAIN * np.linalg.solve(self._squares + penalty, self._products)
+        if self._calls == self.every:  # in all processes at the same time
+            squares, products = (
+                process_group.mean(torch.from_numpy(sums)).numpy() for sums in (self._squares, self._products)
+            )
+            self._weights += GAIN * np.linalg.solve(squares + RIDGE * np.eye(len(MONOMIALS)), products)
             self._start_over()
 
     def state(self) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def calibrate_command(
 ) -> None:
     """Estimate the zero offsets of encoders and IMU; the driver applies them.
 
-    The file corrects what is significant, and leaves the rest.
+    The file corrects the encoders if their zeros together are significant, and the IMU if its tilt is.
 
     \b
     Suspend the robot, and let nothing else send low_cmd:
@@ -125,9 +125,9 @@ def _findings(found: CalibrationFit, has_stood: bool) -> Iterator[str]:
         roll, pitch = np.degrees(written.imu_mounting)
         yield f"IMU: tilted by {roll:+.2f} degrees to the right and {pitch:+.2f} degrees forward"
     if not np.isnan(found.zero_errors).any() and not written.joint_zeros.any():
-        yield "Joints: chance explains all estimates; the file leaves the encoders as they are"
+        yield "Joints: chance explains all estimates; the file does not correct the encoders"
     if not written.imu_mounting.any():
-        yield "IMU: no significant tilt; the file leaves it as it is"
+        yield "IMU: no significant tilt; the file does not correct it"
     if not has_stood:
         yield (
             "A leaning IMU resembles four hips that are off: "

@@ -77,8 +77,8 @@ class CalibrationFit:
         estimate: All offsets as estimated.
         zero_errors: Standard errors of the joint zeros, (12,), rad; NaN if they were not estimated.
         mounting_errors: Standard errors of the IMU's tilt, (2,), rad.
-        calibration: The correction to apply, which leaves what is not significant: all of `estimate` if
-            the zeros together are significant; else the IMU's tilt for encoders that are right.
+        calibration: The correction to apply: all of `estimate` if the zeros together are significant; else
+            the IMU's tilt for encoders that are right, if it is significant.
         unevenness: Largest distance of a foot from the plane of the feet, m; NaN without a standing
             record.
     """
@@ -123,7 +123,7 @@ def _significant(problem: _Problem, estimate: Array, covariance: Array) -> Array
 
     The zeros are tested together (Wald). Significant ones are all corrected: their errors depend on
     each other, and a hip that is left off would shift the other three. Otherwise the encoders count
-    as right, and the IMU is estimated anew.
+    as right, and the IMU is estimated again.
 
     Args:
         problem: The records.
@@ -223,8 +223,8 @@ class _Swing:
 
         tau = k tau_hold(q - z) + tau_inertia + c sign(dq) + d dq + b
 
-    The parameters are zeros z (12,) and mounting (2,), then k, c, d and b of each joint. The fit leaves
-    tau_inertia as it is: noise of the accelerations would make k, and with it z, too small.
+    The parameters are zeros z (12,) and mounting (2,), then k, c, d and b of each joint. The fit does
+    not change tau_inertia: noise of the accelerations would make k, and with it z, too small.
 
     Attributes:
         robot: The robot.
