@@ -2,10 +2,10 @@
 
 A grid search over both delays solves a linear regression for the gains at each pair. All joints
 share the gains. The pair with the least squared error is the model. An offset of a torque sensor or
-an encoder can decide between delays that are far apart: the first, coarse grid is searched with a
-constant of each joint as well, and the delays found so count if they explain the torque about its
-mean clearly better. The cross products of the regressions separate into sums for each delay rather
-than each pair, which makes a grid finer than a millisecond affordable.
+an encoder can decide between delays: they are searched with a constant of each joint as well, and
+the fit with constants counts if it explains the torque about its mean clearly better. The cross
+products of the regressions separate into sums for each delay rather than each pair, which makes a
+grid finer than a millisecond affordable.
 """
 
 from __future__ import annotations
@@ -48,8 +48,9 @@ class Eam:
         input_delay: Input delay, (J,), s.
         output_delay: Output delay, (J,), s.
         window: Step of the drive, over which commands are averaged, s; 0 for none.
-        mse: Mean squared error of the fitted rows, N^2 m^2.
-        variance: The same about the mean error of each joint, N^2 m^2.
+        mse: Mean squared error of the fitted rows, N^2 m^2; after a fit with a constant of each joint,
+            `variance`.
+        variance: Least mean squared error with a constant of each joint, N^2 m^2.
     """
 
     gains: Array
@@ -125,22 +126,21 @@ def _search_delays(samples: Samples, coarse_rows: Bools, rows: Bools, window: fl
     """Best fit for one drive step: coarse grid on `coarse_rows`, then finer grids on all rows."""
     totals, outputs = (_delay_grid(end, _COARSE_STEP_S) for end in _LONGEST_S)
     coarse = _CrossProducts(samples, coarse_rows, totals, outputs, window, 0.0)
-    start, with_constants = coarse.best_fit(), coarse.best_fit(about_means=True)
-    best = _refine_delays(samples, rows, start)
-    if with_constants.delays == start.delays:
-        return best
-    other = _refine_delays(samples, rows, with_constants)
+    best, other = (
+        _refine_delays(samples, rows, coarse.best_fit(about_means), about_means)
+        for about_means in (False, True)
+    )
     return best if best.variance <= _CLEARLY * other.variance else other
 
 
-def _refine_delays(samples: Samples, rows: Bools, eam: Eam) -> Eam:
-    """Best fit on finer grids about the delays of `eam`."""
+def _refine_delays(samples: Samples, rows: Bools, eam: Eam, about_means: bool) -> Eam:
+    """Best fit on finer grids about the delays of `eam`, with a constant of each joint or without."""
     for reach, step in _REFINEMENTS_S:
         about = eam.delays
         totals, outputs = (
             _delay_grid(end, step, near, reach) for end, near in zip(_LONGEST_S, about, strict=True)
         )
-        eam = _CrossProducts(samples, rows, totals, outputs, eam.window, about[0]).best_fit()
+        eam = _CrossProducts(samples, rows, totals, outputs, eam.window, about[0]).best_fit(about_means)
     return eam
 
 
@@ -231,24 +231,24 @@ class _CrossProducts:
         """Solve all regressions.
 
         Args:
-            about_means: Whether a constant of each joint takes part in the choice of the delays.
+            about_means: Whether a constant of each joint takes part in the fit.
 
         Returns:
             The EAM with the pair of delays that has the least mean squared error.
         """
         plain, centred = (_solve(*self._products(means)) for means in (False, True))
-        error = (centred if about_means else plain)[2]
+        *gains, error = centred if about_means else plain
         input_delays = self._totals[:, None] - self._outputs
         possible = (input_delays >= -1e-9) & (input_delays <= MAX_INPUT_DELAY_S + 1e-9)
         at = np.unravel_index(np.argmin(np.where(possible, error, np.inf)), error.shape)
         delays = max(input_delays[at], 0.0), self._outputs[at[1]]
         ones, count = np.ones(len(self._counts)), max(int(self._counts.sum()), 1)
         return Eam(
-            gains=np.array([plain[0][at], plain[1][at]])[:, None] * ones,
+            gains=np.array([one[at] for one in gains])[:, None] * ones,
             input_delay=delays[0] * ones,
             output_delay=delays[1] * ones,
             window=self._window,
-            mse=float(plain[2][at]) / count,
+            mse=float(error[at]) / count,
             variance=float(centred[2][at]) / count,
         )
 
