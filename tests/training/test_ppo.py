@@ -116,6 +116,18 @@ def test_an_update_makes_the_better_action_likelier():
     assert ppo.actor(r.obs)[0][..., 0].mean() > before + 0.02
 
 
+@pytest.mark.parametrize(("signal", "low", "high"), [(1.0, 0.7, 1.0), (0.0, -0.3, 0.3)])
+def test_halves_of_the_robots_agree_on_a_signal_and_not_on_noise(signal, low, high):
+    torch.manual_seed(0)
+    ppo = learner(critic_value=0.0, discount=0.0, epochs=1, mini_batches=1)
+    r = rollout(0.0, t=8, n=512)
+    r.mean = ppo.actor(r.obs)[0].detach()
+    noise = 0.3 * torch.randn(8, 512, 12)
+    r.action = r.mean + noise
+    r.reward = signal * noise[..., 0] + (1.0 - signal) * torch.randn(8, 512)
+    assert low < ppo.update(r, learn_actor=False, measure_agreement=True)["agreement"] < high
+
+
 def test_the_symmetry_term_makes_a_recurrent_policy_symmetric():
     torch.manual_seed(0)
     network = Recurrent(48, 12, memory=16, hidden=(16,))

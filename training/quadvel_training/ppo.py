@@ -259,7 +259,12 @@ class Ppo:
         return advantage, advantage + value[:-1]
 
     def update(
-        self, r: Rollout, learn_actor: bool = True, pull: float = 0.0, constraints: float = 1.0
+        self,
+        r: Rollout,
+        learn_actor: bool = True,
+        pull: float = 0.0,
+        constraints: float = 1.0,
+        measure_agreement: bool = False,
     ) -> dict[str, float]:
         """Learn from one rollout.
 
@@ -268,9 +273,11 @@ class Ppo:
             learn_actor: whether the actor learns, too.
             pull: weight of the distance to the rollout's labels.
             constraints: share of the configured constraint weights, 0 to 1.
+            measure_agreement: whether to measure `agreement` first.
 
         Returns:
-            Means of the loss terms, explained variance and learning rate, for the log.
+            Means of the loss terms, explained variance, learning rate and, if measured, agreement,
+            for the log.
 
         Raises:
             FloatingPointError: a gradient is not finite.
@@ -284,6 +291,9 @@ class Ppo:
         advantage = ((advantage - centre) / (spread + 1e-6)).clamp(-ADVANTAGE_BOUND, ADVANTAGE_BOUND)
         with torch.no_grad():
             old_log_prob = self._log_prob(r, slice(None), r.mean)
+        seen = {"explained_variance": float(explained)}
+        if measure_agreement:
+            seen["agreement"] = self.agreement(r, advantage, old_log_prob)
         total: dict[str, float] = {}
         batches = 0
         for ids in self._mini_batches(r.reward.shape[1], r.reward.device):
@@ -298,7 +308,40 @@ class Ppo:
         means = {name: value / batches for name, value in total.items()}
         if learn_actor and self.config.target_kl is not None:
             self._adapt_rate(means["kl"], self.config.target_kl)
-        return means | {"explained_variance": float(explained), "learning_rate": self.learning_rate}
+        return means | seen | {"learning_rate": self.learning_rate}
+
+    def agreement(self, r: Rollout, advantage: Tensor, old_log_prob: Tensor) -> float:
+        """Compare the gradients of the reward on two random halves of the robots.
+
+        Args:
+            r: rollout.
+            advantage: (T, N), normalised.
+            old_log_prob: (T, N), of the actions under the policy that acted.
+
+        Returns:
+            Cosine of the angle between the two gradients of the actor: near 1 if the rollout is
+            large enough, about 0 if the gradients are noise.
+        """
+        weights = [weight for weight in self.actor.parameters() if weight.requires_grad]
+        gradients = []
+        for ids in torch.randperm(r.reward.shape[1]).to(r.reward.device).chunk(2):
+            mean, _ = self.actor(r.obs[:, ids], r.state and select(r.state, ids))
+            loss = self._surrogate(r, ids, mean, advantage[:, ids], old_log_prob[:, ids])
+            gradient = torch.cat([part.flatten() for part in torch.autograd.grad(loss, weights)])
+            gradients.append(process_group.mean(gradient))
+        return float(torch.nn.functional.cosine_similarity(*gradients, dim=0))
+
+    def _surrogate(
+        self, r: Rollout, ids: Tensor, mean: Tensor, advantage: Tensor, old_log_prob: Tensor
+    ) -> Tensor:
+        """PPO's clipped surrogate (Schulman et al. 2017) of the robots `ids`."""
+        # With r = pi(a) / pi_old(a): L_clip = -mean(min(r A, clip(r, 1 - eps, 1 + eps) A))
+        c = self.config
+        log_ratio = self._log_prob(r, ids, mean) - old_log_prob
+        # an overflow would destroy all weights
+        ratio = log_ratio.clamp(-LOG_RATIO_BOUND, LOG_RATIO_BOUND).exp()
+        clipped = ratio.clamp(1 - c.clip, 1 + c.clip)
+        return -masked_mean(torch.minimum(ratio * advantage, clipped * advantage), r.mask[:, ids])
 
     def _innovations(self, noise: Tensor, before: Tensor) -> Tensor:
         """White innovations of AR(1) noise (T, N, A); `before` (N, A) precedes its first sample."""
@@ -346,13 +389,7 @@ class Ppo:
         c, actor = self.config, self.actor
         pull, constraints = weights
         mean, _ = actor(r.obs[:, ids], r.state and select(r.state, ids))
-        # PPO's clipped surrogate (Schulman et al. 2017), with r = pi(a) / pi_old(a):
-        #     L_clip = -mean(min(r A, clip(r, 1 - eps, 1 + eps) A))
-        log_ratio = self._log_prob(r, ids, mean) - old_log_prob
-        # an overflow would destroy all weights
-        ratio = log_ratio.clamp(-LOG_RATIO_BOUND, LOG_RATIO_BOUND).exp()
-        clipped = ratio.clamp(1 - c.clip, 1 + c.clip)
-        surrogate = -masked_mean(torch.minimum(ratio * advantage, clipped * advantage), mask)
+        surrogate = self._surrogate(r, ids, mean, advantage, old_log_prob)
         variance = (2 * actor.log_std).exp().detach()
 
         seen = ids < self.mirrored_count(r.reward.shape[1])
