@@ -102,16 +102,18 @@ def test_the_student_gets_its_share_as_soon_as_it_grows(run):
     assert run.driven.mean() == pytest.approx(SMALL.driven, abs=0.1)
 
 
-def test_the_student_learns_to_imitate_the_teacher(run):
+def test_the_student_learns_to_imitate_the_teacher_and_to_recall_the_past(run):
     start = run._memory
-    obs, label, mask, _ = run.collect()
-    losses = [run.learn(obs, label, mask, start) for _ in range(25)]
-    assert losses[-1] < 0.5 * losses[0]
+    experience, _ = run.collect()
+    losses = [run.learn(experience, start) for _ in range(25)]
+    assert losses[-1]["imitation"] < 0.5 * losses[0]["imitation"]
+    assert losses[-1]["recall"] < 0.5 * losses[0]["recall"]
 
 
 def test_a_robot_that_fell_teaches_nothing_until_it_starts_over(run):
     run.env._qpos[3, 2] = 0.05
-    _, _, mask, _ = run.collect()
+    experience, _ = run.collect()
+    mask = experience.mask
     assert mask[0, 3] == 1.0
     assert (mask[1:, 3] == 0.0).all()
     memory = [part.clone() for part in run._memory]

@@ -11,7 +11,8 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 from quadvel_eval.gait_kind import GaitKind  # noqa: E402
 from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.gait_clock import START_PHASE, GaitClock, duty_factor, step_frequency  # noqa: E402
-from quadvel_training.privileged import ACTION_SCALE, Past, total_action  # noqa: E402
+from quadvel_training.past import Past  # noqa: E402
+from quadvel_training.privileged import ACTION_SCALE, total_action  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
 from tests.helpers.robots import ALIENGO  # noqa: E402
 

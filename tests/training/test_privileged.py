@@ -15,10 +15,10 @@ from quadvel_training import loop, privileged, process_group, scripted_trot  # n
 from quadvel_training.command_grid import CELL_WIDTH, INITIAL_REACH, CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.gait_clock import GaitClock  # noqa: E402
+from quadvel_training.past import LASTING_S, MAX_LAG_M, STANDING_S, TRANSIENT_S, Past  # noqa: E402
 from quadvel_training.privileged import (  # noqa: E402
     CommandScorer,
     NumberedCheckpoints,
-    Past,
     PrivilegedConfig,
     PrivilegedRun,
 )
@@ -207,13 +207,13 @@ def test_an_error_that_lasts_is_that_of_this_command_alone_and_without_its_begin
     command[:, :2], command[:, 2] = env.velocity[:, :2] + error[:2], env.angular_velocity[:, 2] + error[2]
     past.clock.velocity[:] = command[:, :3]
     env.changed[:] = False
-    for _ in range(round(0.9 * privileged.TRANSIENT_S / env.config.period)):
+    for _ in range(round(0.9 * TRANSIENT_S / env.config.period)):
         past.advance(command)
     assert (past.lasting == 0.0).all()
-    for _ in range(round(10 * privileged.LASTING_S / env.config.period)):
+    for _ in range(round(10 * LASTING_S / env.config.period)):
         past.advance(command)
     assert past.lasting == pytest.approx(np.tile(error, (4, 1)), rel=1e-3)
-    assert past.lag == pytest.approx(np.tile([privileged.MAX_LAG_M, -privileged.MAX_LAG_M], (4, 1)))
+    assert past.lag == pytest.approx(np.tile([MAX_LAG_M, -MAX_LAG_M], (4, 1)))
     env.changed[1] = True
     past.advance(command)
     env.changed[:] = False
@@ -273,10 +273,10 @@ def test_a_robot_stands_once_its_four_feet_have_been_down_for_a_while():
     env = VelocityEnv(CALM)
     past, command = Past(env), np.zeros((4, 4))
     env.contact[:] = True
-    for _ in range(round(0.5 * privileged.STANDING_S / env.config.period)):
+    for _ in range(round(0.5 * STANDING_S / env.config.period)):
         past.advance(command)
     assert not past.standing.any()
-    for _ in range(round(privileged.STANDING_S / env.config.period)):
+    for _ in range(round(STANDING_S / env.config.period)):
         past.advance(command)
         env.contact[1, 2] = False
     assert past.standing.tolist() == [True, False, True, True]

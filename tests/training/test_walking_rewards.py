@@ -15,7 +15,8 @@ from quadvel_training.__main__ import app  # noqa: E402
 from quadvel_training.command_grid import CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.gait_clock import duty_factor  # noqa: E402
-from quadvel_training.privileged import Past, PrivilegedConfig, PrivilegedRun  # noqa: E402
+from quadvel_training.past import Past  # noqa: E402
+from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun  # noqa: E402
 from quadvel_training.randomisation import RATED_SPEED, RATED_STALL, Randomisation, rated_drives  # noqa: E402
 from quadvel_training.walking_rewards import (  # noqa: E402
     OVERSPEED_SHARE,

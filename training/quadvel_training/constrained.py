@@ -29,8 +29,9 @@ from .command_shift import CommandShift
 from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, TimeShares, linear, load
 from .networks import Gaussian, Mlp, Recurrent, State, torch_mirror
+from .past import Past, velocity_error
 from .ppo import RECURRENT_PPO, Ppo, PpoConfig, Rollout, exploration_scales
-from .privileged import CommandScorer, Past, velocity_error
+from .privileged import CommandScorer
 from .randomisation import Randomisation, load_actuator
 from .rewards import RewardWeights, Table2
 from .walking_rewards import error_magnitudes
@@ -38,6 +39,7 @@ from .walking_rewards import error_magnitudes
 CRITIC_SIZE = (
     privileged.STATE_SIZE + privileged.CRITIC_EXTRA_SIZE + 12 + 12
 )  # the last two: joint torques and exploration noise
+AGREEMENT_UPDATES = 10  # from one measurement of how far the gradients of two halves agree to the next
 PARTS = ("physics", "sensing", "inference", "learning")  # of the time of an update; sensing includes rewards
 
 
@@ -253,8 +255,9 @@ class ConstrainedRun:
         rollout, seen = self.collect()
         self.updates += 1
         constraints = linear(0.0, 1.0, self.samples / c.constraint_samples)
+        actor_learns, compared = self.updates > c.critic_first, self.updates % AGREEMENT_UPDATES == 0
         with self.shares.measure("learning"):
-            learned = self.ppo.update(rollout, self.updates > c.critic_first, pull, constraints)
+            learned = self.ppo.update(rollout, actor_learns, pull, constraints, compared)
             self._follow_weights()
         return (
             seen

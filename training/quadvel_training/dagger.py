@@ -8,8 +8,10 @@ student falls far more often than by itself, and its advice is worth little. Eac
 place in the order in which the student takes over. If drivers were drawn for each episode, few
 robots would stay with a student that falls soon.
 
-The student removes steady errors less than its teacher does, so the teacher follows shifted commands
-(`command_shift`).
+The student has to remember what the teacher is told of the past: errors over a stride and over
+seconds, and the phase of its steps. So its sequences last for seconds, and a linear map from its
+memory, which is not part of the policy, learns to say these numbers. What is left of its steady
+errors the teacher removes by shifted commands (`command_shift`).
 """
 
 from __future__ import annotations
@@ -42,17 +44,19 @@ from .command_grid import CommandGrid, GridConfig
 from .command_shift import CommandShift
 from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, CheckpointError, cosine, linear, load, set_rate
-from .networks import Recurrent, State, select
+from .networks import MEMORY, Recurrent, State, select
 from .onnx_file import commit, export
+from .past import Past
 from .ppo import IMITATION_HUBER_DELTA, masked_mean
-from .privileged import ACTION_BOUND, ACTION_SCALE, Past
+from .privileged import ACTION_BOUND, ACTION_SCALE
 from .randomisation import Randomisation, load_actuator
 from .walking_rewards import SAMPLE_S, error_magnitudes
 
 HOLD_TICKS = round(SAMPLE_S / TICK_S)  # the teacher learned with actions held for so long
+PAST_SIZE = 3 + 3 + 2 + 5  # what the teacher is told of the past
 AVERAGED_TICKS = 3
 """Ticks over which the teacher's actions are averaged: held actions act late by as much"""
-SHIFT_SEQUENCES = 30  # from one change of the shifted commands to the next: a million samples of 512 robots
+SHIFT_SEQUENCES = 8  # from one change of the shifted commands to the next: a million samples of 512 robots
 
 
 @attrs.frozen
@@ -64,7 +68,7 @@ class DaggerConfig:
         budget: when the run ends.
         n: number of robots, of all processes together.
         threads: threads of the physics.
-        length: ticks per sequence; 64 are 0.32 s.
+        length: ticks per sequence; 256 are 1.28 s.
         epochs: passes over each sequence.
         mini_batches: optimiser steps per pass.
         learning_rate: learning rate of Adam at the start.
@@ -72,6 +76,7 @@ class DaggerConfig:
         driven: share of robots that the student drives at the end.
         first_driven: the same at the start.
         takeover: samples from `first_driven` to `driven`.
+        recall: weight of the error of what a linear map of the memory says of the past.
         noise: standard deviation of the noise of every action, in the network's unit.
         noise_time: s, time constant of the noise.
         timestep: s, of the physics.
@@ -86,14 +91,15 @@ class DaggerConfig:
     budget: Budget = Budget(samples=2e7, minutes=60.0)
     n: int = 512
     threads: int = attrs.field(factory=available_cores)
-    length: int = 64
+    length: int = 256
     epochs: int = 2
-    mini_batches: int = 16
+    mini_batches: int = 32
     learning_rate: float = 7e-4
     final_learning_rate: float = 7e-5
     driven: float = 0.8
     first_driven: float = 0.2
     takeover: float = 2e6
+    recall: float = 0.1
     noise: float = 0.09
     noise_time: float = 0.05
     timestep: float = 0.0025
@@ -102,6 +108,23 @@ class DaggerConfig:
     grid: GridConfig = GridConfig()
     terrain: Terrain = Terrain()
     randomisation: Randomisation = Randomisation()
+
+
+@attrs.frozen
+class Experience:
+    """T ticks of N robots, time first.
+
+    Attributes:
+        obs: (T, N, 48), observations.
+        label: (T, N, 12), actions of the teacher.
+        past: (T, N, PAST_SIZE), what the teacher is told of the past.
+        mask: (T, N), 1 for robots that are up.
+    """
+
+    obs: Tensor
+    label: Tensor
+    past: Tensor
+    mask: Tensor
 
 
 class Teacher:
@@ -172,6 +195,17 @@ class Teacher:
         self.past.advance(command + self.shift.of(command))
         self._executed.append(executed.clip(-ACTION_BOUND, ACTION_BOUND))
 
+    def seen_of_the_past(self) -> np.ndarray:
+        """What the teacher is told that a memory has to keep.
+
+        Returns:
+            (n, PAST_SIZE), scaled to about 1: errors over a stride and lasting ones, lag, plan.
+        """
+        past = self.past
+        return np.concatenate(
+            [2 * past.stride, 4 * past.lasting, 4 * past.lag, past.clock.observation()], axis=1
+        ).astype(np.float32)
+
     def stride_error(self) -> np.ndarray:
         """Compute the error over a stride, relative to the commands as they are.
 
@@ -212,8 +246,9 @@ class DaggerRun:
         self.env = VelocityEnv(env_config, self.grid)
         self.teacher = Teacher(checkpoint, self.env, CommandShift(SHIFT_SEQUENCES))
         self.student = Recurrent(OBSERVATION_SIZE, 12)
+        self.recall = torch.nn.Linear(MEMORY, PAST_SIZE)
         self.map = action_map(self.env)
-        self.optimiser = torch.optim.Adam(self.student.parameters(), lr=c.learning_rate)
+        self.optimiser = torch.optim.Adam(self._learning().parameters(), lr=c.learning_rate)
         self.samples = 0
         self._memory: State = self.student.initial_state(c.n)
         self._previous = np.zeros((c.n, 12), np.float32)
@@ -229,6 +264,7 @@ class DaggerRun:
         """
         return {
             "student": self.student.state_dict(),
+            "recall": self.recall.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "grid": self.grid.state(),
             "shift": self.teacher.shift.state(),
@@ -243,11 +279,16 @@ class DaggerRun:
             state: what `state` returned.
         """
         self.student.load_state_dict(state["student"])
+        self.recall.load_state_dict(state["recall"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.teacher.shift.restore(state["shift"])
         self.samples = state["samples"]
         process_group.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
+
+    def _learning(self) -> torch.nn.ModuleList:
+        """Networks that learn."""
+        return torch.nn.ModuleList([self.student, self.recall])
 
     def _share(self) -> float:
         """Share of robots that the student drives now."""
@@ -281,11 +322,11 @@ class DaggerRun:
         c = self.config
         set_rate(self.optimiser, cosine(c.learning_rate, c.final_learning_rate, done))
         start = self._memory
-        obs, label, mask, seen = self.collect()
-        loss = self.learn(obs, label, mask, start)
+        experience, seen = self.collect()
+        seen |= self.learn(experience, start)
         handed_over = self.driven != (self._turn < self._share())
-        self._start_over(np.flatnonzero((mask[-1].numpy() == 0.0) | handed_over))
-        return {"imitation": loss} | seen
+        self._start_over(np.flatnonzero((experience.mask[-1].numpy() == 0.0) | handed_over))
+        return seen
 
     def _act(self, obs: np.ndarray) -> np.ndarray:
         """Run the student for one tick; return its actions (n, 12)."""
@@ -294,30 +335,27 @@ class DaggerRun:
         own: np.ndarray = action[0].numpy()
         return own
 
-    def collect(self) -> tuple[Tensor, Tensor, Tensor, dict[str, float]]:
+    def collect(self) -> tuple[Experience, dict[str, float]]:
         """Collect one sequence of every robot.
 
         Returns:
-            Observations (T, N, 48), the teacher's actions (T, N, 12), the mask (T, N) of robots
-            that are up, and figures for the log.
+            The sequences, and figures for the log.
         """
         env, c = self.env, self.config
         # Ornstein-Uhlenbeck noise: n <- d n + noise sqrt(1 - d^2) w, d = exp(-dt / noise_time)
         decay = np.float32(np.exp(-TICK_S / c.noise_time))
         drawn_std = np.float32(c.noise * np.sqrt(1 - decay**2))
         alive, fell = np.ones(c.n, bool), np.zeros(c.n, bool)
-        observations: list[np.ndarray] = []
-        labels: list[np.ndarray] = []
-        masks: list[np.ndarray] = []
+        rows: dict[str, list[np.ndarray]] = {name: [] for name in attrs.fields_dict(Experience)}
         for _ in range(c.length):
             obs, label = observe(env, self._previous), self.teacher.action()
             own = self._act(obs)
             drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
             self._noise = decay * self._noise + drawn_std * drawn
             self._previous = np.where(self.driven[:, None], own, label) + self._noise
-            observations.append(obs)
-            labels.append(label)
-            masks.append(alive.copy())
+            seen = obs, label, self.teacher.seen_of_the_past(), alive.copy()
+            for values, value in zip(rows.values(), seen, strict=True):
+                values.append(value)
             command = env.command.copy()
             env.tick(self.map.targets(self._previous))
             self.teacher.advance(command, self._previous)
@@ -325,12 +363,10 @@ class DaggerRun:
             alive &= ~(env.fallen | env.timed_out)
         steady = self.driven & alive & self.teacher.past.settled & (env.command[:, 3] < 0.5)
         self.teacher.shift.add(env.command[steady], self.teacher.stride_error()[steady])
-        masks[-1] = alive  # robots that end in the last tick count as ended, too
+        rows["mask"][-1] = alive  # robots that end in the last tick count as ended, too
         self.samples += c.length * c.n * process_group.size()
-        obs_t, label_t, mask_t = (
-            torch.from_numpy(np.array(x, dtype=np.float32)) for x in (observations, labels, masks)
-        )
-        return obs_t, label_t, mask_t, self._figures(alive, fell)
+        tensors = [torch.from_numpy(np.array(values, dtype=np.float32)) for values in rows.values()]
+        return Experience(*tensors), self._figures(alive, fell)
 
     def _figures(self, alive: np.ndarray, fell: np.ndarray) -> dict[str, float]:
         """Return errors over a stride (m/s, rad/s) and falls per robot-minute, by driver."""
@@ -345,33 +381,35 @@ class DaggerRun:
                 seen[f"{name}_falls"] = float((fell & driver).sum() / minutes)
         return seen
 
-    def learn(self, obs: Tensor, label: Tensor, mask: Tensor, start: State) -> float:
+    def learn(self, experience: Experience, start: State) -> dict[str, float]:
         """Take an optimiser step for each mini-batch of robots, in each pass.
 
         Args:
-            obs: (T, N, 48), observations.
-            label: (T, N, 12), actions of the teacher.
-            mask: (T, N), 1 for robots that are up.
+            experience: one sequence of every robot.
             start: memory of the student at the start of the sequence.
 
         Returns:
-            Mean loss.
+            Mean losses of the imitation and of the recall.
         """
-        c, total = self.config, 0.0
+        c, e = self.config, experience
         passes = [torch.randperm(c.n).chunk(c.mini_batches) for _ in range(c.epochs)]
+        losses = []
         for ids in itertools.chain(*passes):
-            action, _ = self.student(obs[:, ids], select(start, ids))
-            error = torch.nn.functional.huber_loss(
-                action, label[:, ids], reduction="none", delta=IMITATION_HUBER_DELTA
+            memory, _ = self.student.lstm(e.obs[:, ids], select(start, ids))
+            # L = mean(Huber(action - label)) + recall mean(|A memory + b - past|^2)
+            huber = torch.nn.functional.huber_loss(
+                self.student.answer(memory), e.label[:, ids], reduction="none", delta=IMITATION_HUBER_DELTA
             )
-            loss = masked_mean(error.mean(-1), mask[:, ids])
+            missed = (self.recall(memory) - e.past[:, ids]) ** 2
+            imitation, recall = (masked_mean(error.mean(-1), e.mask[:, ids]) for error in (huber, missed))
             self.optimiser.zero_grad()
-            loss.backward()
-            process_group.share_gradients(self.student)
-            torch.nn.utils.clip_grad_norm_(self.student.parameters(), 1.0)
+            (imitation + c.recall * recall).backward()
+            process_group.share_gradients(self._learning())
+            torch.nn.utils.clip_grad_norm_(self._learning().parameters(), 1.0)
             self.optimiser.step()
-            total += float(loss.detach())
-        return total / sum(map(len, passes))
+            losses.append((float(imitation.detach()), float(recall.detach())))
+        imitation_mean, recall_mean = np.mean(losses, axis=0)
+        return {"imitation": float(imitation_mean), "recall": float(recall_mean)}
 
 
 def load_policy(checkpoint: Path) -> Recurrent:

@@ -141,8 +141,20 @@ class Recurrent(nn.Module):
         Returns:
             (T, N, outputs), and the memory after it.
         """
-        y, state = self.lstm(x, state)
-        return self.body(nn.functional.silu(y)), state
+        memory, state = self.lstm(x, state)
+        return self.answer(memory), state
+
+    def answer(self, memory: Tensor) -> Tensor:
+        """Evaluate the linear layers.
+
+        Args:
+            memory: (T, N, memory), outputs of the LSTM.
+
+        Returns:
+            (T, N, outputs).
+        """
+        answer: Tensor = self.body(nn.functional.silu(memory))
+        return answer
 
 
 class Gaussian(nn.Module):

@@ -20,10 +20,10 @@ from quadvel_eval.gait_kind import GaitKind
 from .env import EnvConfig, VelocityEnv
 from .loop import load
 from .networks import Gaussian
+from .past import Past
 from .privileged import (
     ACTION_SCALE,
     NumberedCheckpoints,
-    Past,
     PrivilegedConfig,
     load_teacher,
     observe,

@@ -6,13 +6,12 @@ left to the policy.
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import attrs
 import numpy as np
 
 from .env import VelocityEnv
-from .gait_clock import GaitClock, foot_pace
+from .gait_clock import foot_pace
+from .past import Past
 
 SAMPLE_S = 0.02  # how long the teacher holds an action
 MIN_REWARD, MAX_REWARD = -6.0, 4.0  # bounds of a sample's sum of terms, without falls
@@ -48,15 +47,6 @@ def hip_deviation(env: VelocityEnv, command: np.ndarray) -> np.ndarray:
     astray = np.abs(env.q[:, ::3]).sum(axis=1)
     # sum |q_hip| / (1 + 2 |vy|)
     return np.asarray(astray / (1.0 + 2.0 * np.abs(command[:, 1])))
-
-
-class Past(Protocol):
-    """Interface of `privileged.Past`, as far as the rewards use it."""
-
-    stride: np.ndarray
-    lasting: np.ndarray
-    off_hip: np.ndarray
-    clock: GaitClock
 
 
 @attrs.frozen
