@@ -54,6 +54,29 @@ def set_back(t: np.ndarray) -> np.ndarray:
     return t + np.where(np.arange(len(t)) >= len(t) // 2, 1.7e9, 0.0)
 
 
+def read_in_bursts(t: np.ndarray, size: int) -> np.ndarray:
+    """Stamps of a buffer that is read whenever it holds `size` rows."""
+    row = np.arange(len(t))
+    last = np.minimum((row // size + 1) * size - 1, len(t) - 1)
+    return t[last] + 0.02 * (t[1] - t[0]) * (row % size)
+
+
+@pytest.mark.parametrize("size", [2, 3, 5])
+def test_rows_that_were_read_in_bursts_get_the_times_of_their_measurement(size: int) -> None:
+    t = fields()["t"]
+    checked = check_log(log(t=read_in_bursts(t, size), t_cmd=t))
+    checked.raise_refusal()
+    assert np.abs(checked.log.t - t)[:-size].max() < 0.2 * (t[1] - t[0])
+    assert any(finding.field == "t" and finding.kind == "warning" for finding in checked.findings)
+
+
+def test_a_receiver_that_is_late_at_times_keeps_its_stamps() -> None:
+    t = fields()["t"]
+    late = t + np.abs(np.random.default_rng(0).normal(0.0, 0.5 * (t[1] - t[0]), len(t)))
+    stamps = np.maximum.accumulate(late) + 1e-6 * np.arange(len(t))
+    assert np.array_equal(check_log(log(t=stamps, t_cmd=t)).log.t, stamps)
+
+
 def test_finding_names_the_joint_with_the_defect() -> None:
     noise = np.where(np.arange(12) == 1, np.random.default_rng(0).normal(size=(2000, 12)), fields()["tau"])
     warnings = texts(check_log(log(tau=noise)), "warning")

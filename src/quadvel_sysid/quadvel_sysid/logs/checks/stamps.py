@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import attrs
 import numpy as np
 
 from ..findings import Finding
@@ -22,6 +23,42 @@ MAX_PERIOD_S, MIN_PERIOD_S = 0.5, 1e-5
 """s between two rows, from `MIN_PERIOD_S` to `MAX_PERIOD_S`; another spacing means another unit of
 time.
 """
+
+BURST_STEP = 0.1
+"""Steps below this share of the mean step belong to a burst: one read of a buffer that held several rows."""
+MIN_BURST_SHARE = 0.3
+"""Share of such steps from which a log was stamped when a buffer was read; a slow receiver alone has fewer."""
+
+
+def bursts(log: Log) -> Iterator[Finding | Log]:
+    """Rows that follow each other at once: stamps of reading a buffer, not of measuring.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        The log with the rows of each burst spread over the time since the burst before, and a warning.
+    """
+    steps = np.diff(log.t)
+    regular = steps[steps < GAP_FACTOR * np.percentile(steps, 95)]
+    period = float(regular.mean())
+    share = float(np.mean(steps < BURST_STEP * period))
+    if share < MIN_BURST_SHARE:
+        return
+    # The last row of a burst was measured when it was read. Its m rows were measured every period
+    # before, but after the last burst: t_k = start + (end - start) (k + 1) / m.
+    last = np.append(np.flatnonzero(steps >= BURST_STEP * period), len(log.t) - 1)
+    size = np.diff(last, prepend=-1)
+    end = log.t[last]
+    start = np.maximum(np.append(-np.inf, end[:-1]), end - size * period)
+    within = np.arange(len(log.t)) - np.repeat(last - size, size)
+    t = np.repeat(start, size) + np.repeat((end - start) / size, size) * within
+    text = (
+        f"t: {share:.0%} of the rows come at once after the row before, as if a buffer of {size.max()} rows was read; "
+        "they are spread over the time since the last read"
+    )
+    yield Finding("warning", "t", (), text)
+    yield attrs.evolve(log, t=t, t_cmd=log.t_cmd if log.has_own_command_stamps else t)
 
 
 def time_bases(log: Log) -> Iterator[Finding]:

@@ -38,6 +38,12 @@ class Check:
 
 ROW_CHECKS = (
     Check(
+        stamps.bursts,
+        f"share of the steps below {stamps.BURST_STEP:.0%} of the mean step",
+        f"{stamps.MIN_BURST_SHARE:.0%}",
+        "the rows of a burst are spread over the time since the last one, with a warning",
+    ),
+    Check(
         stamps.time_bases,
         "spacing of the rows, s; its longest step; the spans of t and t_cmd",
         f"{stamps.MIN_PERIOD_S:g} to {stamps.MAX_PERIOD_S:g} s; a day; {stamps.MAX_SPAN_RATIO:g} times as long",
