@@ -203,7 +203,7 @@ class Teacher:
         """
         past = self.past
         return np.concatenate(
-            [2 * past.stride, 4 * past.lasting, 4 * past.lag, past.clock.observation()], axis=1
+            [3 * past.stride, 12 * past.lasting, 8 * past.lag, past.clock.observation()], axis=1
         ).astype(np.float32)
 
     def stride_error(self) -> np.ndarray:
