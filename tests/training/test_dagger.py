@@ -67,6 +67,17 @@ def test_the_file_holds_its_command_limits_and_how_to_run_it(run, tmp_path):
     assert metadata.actuator["delta_kp"] == pytest.approx(-0.706)
 
 
+def test_a_new_student_has_cells_that_remember_for_seconds(run):
+    """A memory that is set once and fed zeros decays with its cells' time constants."""
+    _, cell = run.student.initial_state(1)
+    state = (torch.zeros_like(cell), torch.ones_like(cell))
+    with torch.no_grad():
+        _, (_, after) = run.student.lstm(torch.zeros(100, 1, 48), state)
+    left = after[0, 0]
+    assert (left[dagger.SLOW_CELLS :].abs() < 0.5).all()
+    assert 0.5 < left[dagger.SLOW_CELLS - 4 : dagger.SLOW_CELLS].mean() < 1.0
+
+
 def test_the_teacher_knows_what_was_done_20_ms_ago(run):
     teacher, seen = run.teacher, []
     for i in range(6):

@@ -44,7 +44,7 @@ from .command_grid import CommandGrid, GridConfig
 from .command_shift import CommandShift
 from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, CheckpointError, cosine, linear, load, set_rate
-from .networks import MEMORY, Recurrent, State, select
+from .networks import MEMORY, Recurrent, State, lengthen_memory, select
 from .onnx_file import commit, export
 from .past import Past
 from .ppo import IMITATION_HUBER_DELTA, masked_mean
@@ -54,6 +54,7 @@ from .walking_rewards import SAMPLE_S, error_magnitudes
 
 HOLD_TICKS = round(SAMPLE_S / TICK_S)  # the teacher learned with actions held for so long
 PAST_SIZE = 3 + 3 + 2 + 5  # what the teacher is told of the past
+SLOW_CELLS, LONGEST_MEMORY_S = MEMORY // 4, 4.0  # cells of a new student that forget slowly, up to this time
 AVERAGED_TICKS = 3
 """Ticks over which the teacher's actions are averaged: held actions act late by as much"""
 SHIFT_SEQUENCES = 8  # from one change of the shifted commands to the next: a million samples of 512 robots
@@ -246,6 +247,7 @@ class DaggerRun:
         self.env = VelocityEnv(env_config, self.grid)
         self.teacher = Teacher(checkpoint, self.env, CommandShift(SHIFT_SEQUENCES))
         self.student = Recurrent(OBSERVATION_SIZE, 12)
+        lengthen_memory(self.student.lstm, SLOW_CELLS, LONGEST_MEMORY_S / TICK_S)
         self.recall = torch.nn.Linear(MEMORY, PAST_SIZE)
         self.map = action_map(self.env)
         self.optimiser = torch.optim.Adam(self._learning().parameters(), lr=c.learning_rate)

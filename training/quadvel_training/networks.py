@@ -157,6 +157,27 @@ class Recurrent(nn.Module):
         return answer
 
 
+@torch.no_grad()  # type: ignore[untyped-decorator]
+def lengthen_memory(lstm: nn.LSTM, cells: int, longest: float) -> None:
+    """Let the first cells of an LSTM forget slowly from the start (Tallec and Ollivier, 2018).
+
+    The forget gate of a new LSTM is about 1/2, so that it forgets within two ticks. Sequences of a
+    second change that little in millions of samples.
+
+    Args:
+        lstm: LSTM, changed in place.
+        cells: number of cells.
+        longest: longest time constant, ticks; they are log-uniform from 1 tick on.
+    """
+    # f = sigmoid(ln(T - 1)) = 1 - 1/T forgets with a time constant of T ticks; i = 1 - f = 1/T.
+    ticks = torch.logspace(0.0, 1.0, cells, base=longest).clamp(min=2.0)
+    size = lstm.hidden_size  # PyTorch's gates are stacked: input, forget, cell, output
+    lstm.bias_ih_l0[:cells] = -torch.log(ticks - 1.0)
+    lstm.bias_ih_l0[size : size + cells] = torch.log(ticks - 1.0)
+    lstm.bias_hh_l0[:cells] = 0.0
+    lstm.bias_hh_l0[size : size + cells] = 0.0
+
+
 class Gaussian(nn.Module):
     """Normal distribution of actions with a standard deviation independent of the state."""
 
