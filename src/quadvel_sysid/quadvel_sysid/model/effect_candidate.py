@@ -157,6 +157,11 @@ class EffectCandidate:
         return None
 
     @property
+    def replaces_law(self) -> bool:
+        """Whether it can stand for the gains of the PD law: a filter of angles is a speed, for example."""
+        return False
+
+    @property
     def indistinguishable_forms(self) -> tuple[EffectCandidate, ...]:
         """Forms that no log distinguishes from this one.
 

@@ -41,12 +41,13 @@ class Unknowns:
         return len(self.low)
 
     @classmethod
-    def of(cls, model: Model, delays: bool = True) -> Unknowns:
+    def of(cls, model: Model, delays: bool = True, all_gains: bool = False) -> Unknowns:
         """Collect the unknowns of a model.
 
         Args:
             model: The model to fit.
             delays: Whether the delays are fitted.
+            all_gains: Whether gains are unknowns also where `Model.holds_gains`.
 
         Returns:
             The mapping, with one unknown for each slot and group of joints.
@@ -55,7 +56,7 @@ class Unknowns:
         low: list[float] = []
         high: list[float] = []
         step: list[float] = []
-        for groups, free, bounds, size in _parameter_slots(model, delays):
+        for groups, free, bounds, size in _parameter_slots(model, delays, all_gains):
             names = np.unique(groups[free])
             rows.append(np.where(free, len(low) + np.searchsorted(names, groups), -1))
             low += [bounds[0]] * len(names)
@@ -107,13 +108,14 @@ DELAY_STEP_S = 0.0003
 
 
 def _parameter_slots(
-    model: Model, delays: bool
+    model: Model, delays: bool, all_gains: bool
 ) -> Iterator[tuple[Indices, Bools, tuple[float, float], float]]:
     """Indices, free joints, bounds and finite-difference step of each slot."""
     everywhere = np.ones(model.gains.shape[1], dtype=bool)
     has_gains = model.samples.commanded and not model.samples.undamped
+    free = everywhere if all_gains else ~model.holds_gains
     for _ in model.gains:
-        yield model.gain_groups, everywhere, (0.0, _MAX_GAIN_RATIO if has_gains else 1e6), RELATIVE_STEP
+        yield model.gain_groups, free, (0.0, _MAX_GAIN_RATIO if has_gains else 1e6), RELATIVE_STEP
     for effect in model.effects:
         for parameter in effect.candidate.parameters:
             yield (

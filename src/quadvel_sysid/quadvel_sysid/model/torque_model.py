@@ -47,6 +47,9 @@ class Model:
         delays: Input and output delay, (2, J), s.
         delay_groups: Group numbers of the joints, (J,), for the delays.
         effects: Effects, in the order in which they were added.
+        law_gains: Gains as they were before a learned term was added, (2, J); None without one. A
+            learned term can take over a part of the PD law, such as the speed from earlier angles;
+            the encoder noise that a model is charged for must not fall with it.
     """
 
     samples: Samples
@@ -56,6 +59,15 @@ class Model:
     delays: Array
     delay_groups: Indices
     effects: tuple[AppliedEffect, ...] = ()
+    law_gains: Array | None = None
+
+    @property
+    def holds_gains(self) -> Bools:
+        """Joints (J,) whose gains a fit leaves as they are, as a term there could replace the PD law."""
+        terms = [effect.active for effect in self.effects if effect.candidate.replaces_law]
+        joints = np.any(terms, axis=0) if terms else np.zeros(len(self.gain_groups), dtype=bool)
+        held: Bools = np.isin(self.gain_groups, self.gain_groups[joints])
+        return held
 
     @property
     def signals(self) -> Signals:
@@ -108,7 +120,8 @@ class Model:
         """
         # tau holds g_p kp e_q + g_d kd e_dq, with the noise e of q and dq at the instant u.
         s, (q_noise, dq_noise) = self.signals, self.samples.sources.encoder_noise
-        noise: Array = (self.gains[0] * s.kp) ** 2 * q_noise + (self.gains[1] * s.kd) ** 2 * dq_noise
+        kp, kd = self.gains if self.law_gains is None else self.law_gains
+        noise: Array = (kp * s.kp) ** 2 * q_noise + (kd * s.kd) ** 2 * dq_noise
         return noise * s.averaging
 
     def noise_averaged_by_effects(self, rows: Bools) -> Array:
@@ -129,7 +142,8 @@ class Model:
         #     d = tau(q + e_q, dq + e_dq) - tau(q, dq);   result = mean(d_plain^2 - d^2), at least 0
         if not self.effects:
             return np.zeros(rows.shape[1])
-        plain, noisy = attrs.evolve(self, effects=()), self.samples.noisier
+        law = self.gains if self.law_gains is None else self.law_gains
+        plain, noisy = attrs.evolve(self, effects=(), gains=law), self.samples.noisier
         with_effects, without = (
             attrs.evolve(one, samples=noisy).predict() - one.predict() for one in (self, plain)
         )
@@ -276,7 +290,12 @@ class Model:
         Returns:
             A new model.
         """
-        return attrs.evolve(self, effects=(*self.effects, applied))
+        is_first_learned = applied.candidate.penalty is not None and self.law_gains is None
+        return attrs.evolve(
+            self,
+            effects=(*self.effects, applied),
+            law_gains=self.gains if is_first_learned else self.law_gains,
+        )
 
     def with_replaced_effect(self, index: int, applied: AppliedEffect) -> Model:
         """Return the model with one effect replaced.

@@ -23,7 +23,7 @@ from quadvel_actuator.effects.basis_regressors import (
     multiplier,
     read_signal,
 )
-from quadvel_actuator.effects.shapes import Curve, Shape
+from quadvel_actuator.effects.shapes import Curve, Filter, Shape
 from quadvel_actuator.running import ACCELERATION_WINDOW_S
 from quadvel_description.arrays import Array, Bools
 
@@ -32,6 +32,8 @@ from ..model.effect_candidate import EffectCandidate
 
 _CACHE_SIZE = 12
 """Number of cached sets of regressors."""
+_LAW_SIGNALS = "q", "dq", "error"
+"""Signals of the PD law."""
 DRIVE_SIGNALS = "q_des", "error", "tau"
 """Signals of the drive, which follow the commands."""
 _SIGNAL_COST = 5.0
@@ -223,6 +225,11 @@ class RegressorCandidate(EffectCandidate):
     @override
     def penalty(self) -> Array:
         return _penalty(self.effect.shape)
+
+    @property
+    @override
+    def replaces_law(self) -> bool:
+        return isinstance(self.effect.shape, Filter) and self.effect.of in _LAW_SIGNALS
 
     @override
     def allowed_joints(self, joints: Sequence[str]) -> Bools:

@@ -489,10 +489,10 @@ class DelayGridPoint:
             values[[candidate.names.index(name) for name in candidate.linear]] = weights.T
         groups = np.zeros(len(joint), dtype=np.intp) if candidate.shared_by_joints else joint
         effect = AppliedEffect(candidate, candidate.allowed_joints(all_samples.joints), values, groups)
-        moved = attrs.evolve(model, gains=np.maximum(model.gains + change[:2], 0.0)).with_delays(
-            model.delays + change[2:]
-        )
-        return attrs.evolve(moved.with_effect(effect), samples=all_samples)
+        extended = model.with_effect(effect).with_delays(model.delays + change[2:])
+        gains = np.maximum(model.gains + change[:2], 0.0)
+        gains = np.where(extended.holds_gains, model.gains, gains)
+        return attrs.evolve(extended, gains=gains, samples=all_samples)
 
 
 def _ridge_solve(hessian: Array, gradient: Array) -> Array:

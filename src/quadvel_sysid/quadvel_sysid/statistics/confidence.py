@@ -147,7 +147,7 @@ class _Covariance:
     @classmethod
     def of(cls, model: Model, parts: DataSplit, rows: Bools) -> _Covariance:
         """Covariance of a model that was fitted to `rows`."""
-        unknowns = Unknowns.of(model)
+        unknowns = Unknowns.of(model, all_gains=True)
         hessian, _, slopes, residual = normal_equations(model, unknowns, rows)
         degrees_of_freedom = max(int(rows.sum()) - unknowns.count, 1)
 
