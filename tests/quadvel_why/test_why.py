@@ -18,7 +18,8 @@ from quadvel_why.links import CAUSES
 from quadvel_why.links.drives import SpeedTorqueLimit, TorqueLimit
 from quadvel_why.page import page
 from quadvel_why.reading import read_run
-from quadvel_why.run import Commands, Run
+from quadvel_why.report import summary
+from quadvel_why.run import Commands, Modes, Run
 from quadvel_why.signals import PARTS, Signals
 from tests.helpers.robots import ALIENGO
 from tests.quadvel_policy.test_imported import MJLAB, import_policy, write_network
@@ -213,3 +214,23 @@ def test_lost_states_are_no_jump_of_the_angle(run: Run) -> None:
     whole, jumps = Signals(run, None).jumps, Signals(lost, None).jumps
     assert not jumps[[199, 296]].any()
     assert np.abs(jumps).max() <= np.abs(whole).max()
+
+
+def headline(run: Run, modes: list[str], faults: list[str]) -> str:
+    """The first line of the answer for a run with these reports of the controller."""
+    reported = attrs.evolve(run, modes=Modes(np.arange(len(modes)) * 0.1, tuple(modes), tuple(faults)))
+    return summary(reported, Diagnosis(None, {}, {})).splitlines()[0]
+
+
+def test_a_run_is_stopped_by_its_last_fault(run: Run) -> None:
+    line = headline(run, ["walk", "stance", "fault"], ["", "accelerometer_implausible", "joint_too_fast"])
+    assert "stopped by joint_too_fast" in line
+    assert "accelerometer_implausible" not in line
+
+
+def test_a_run_that_went_on_after_a_reset_was_not_stopped(run: Run) -> None:
+    modes = ["walk", "stance", "fault", "passive", "stand_up", "walk"]
+    line = headline(run, modes, ["", "accelerometer_implausible", "joint_too_fast", "", "", ""])
+    assert "last mode walk" in line
+    assert "stopped by" not in line
+    assert "joint_too_fast" in line

@@ -53,10 +53,12 @@ def summary(run: Run, diagnosis: Diagnosis) -> str:
 
 def _fate(run: Run) -> str:
     """How the run ended, as the controller reported it."""
-    if run.modes is None or not run.modes.name:
+    modes = run.modes
+    if modes is None or not modes.name:
         return "no modes recorded"
-    fault = next((fault for fault in run.modes.fault if fault), "")
-    return f"last mode {run.modes.name[-1]}" + (f", stopped by {fault}" if fault else "")
+    stopped = f", stopped by {modes.stopped_by}" if modes.stopped_by else ""
+    recovered = f", after a reset from {', '.join(modes.recovered_from)}" if modes.recovered_from else ""
+    return f"last mode {modes.name[-1]}{stopped}{recovered}"
 
 
 def to_json(run: Run, diagnosis: Diagnosis) -> dict[str, Any]:

@@ -77,6 +77,20 @@ class Modes:
     name: tuple[str, ...]
     fault: tuple[str, ...]
 
+    @property
+    def stopped_by(self) -> str:
+        """Fault that keeps the robot stopped at the end of the run, empty without one.
+
+        A fault that damps the joints replaces the one that made the robot stand.
+        """
+        return self.fault[-1]
+
+    @property
+    def recovered_from(self) -> tuple[str, ...]:
+        """Faults that stopped the robot and were reset before the end of the run."""
+        pairs = zip(self.fault, self.fault[1:], strict=False)
+        return tuple(fault for fault, following in pairs if fault and not following)
+
 
 @attrs.frozen(eq=False)
 class Run:
