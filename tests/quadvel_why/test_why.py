@@ -176,6 +176,17 @@ def test_the_command_writes_the_finding_and_ends_with_1(run: Run, tmp_path: Path
     assert (tmp_path / "out" / "why.png").stat().st_size > 1000
 
 
+def test_a_table_with_other_names_is_read_by_a_column_map(run: Run, tmp_path: Path) -> None:
+    now = np.maximum(run.command_rows(0.0), 0)
+    np.savez(tmp_path / "bench.npz", t=run.time, angles=run.q, dq=run.dq, goal=run.commands.q[now])
+    (tmp_path / "map.yaml").write_text("q: angles\nq_des: goal\n")
+    arguments = [str(tmp_path / "bench.npz"), "--gains", "30", "0.5", "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit) as ended:
+        cli.command("why").main([*arguments, "--columns", str(tmp_path / "map.yaml")])
+    assert ended.value.code in (0, 1)
+    assert (tmp_path / "out/why.json").exists()
+
+
 @pytest.mark.parametrize("policy", ["none", "imported.onnx"])
 def test_without_a_policy_to_replay_the_other_causes_are_examined(
     policy: str,
