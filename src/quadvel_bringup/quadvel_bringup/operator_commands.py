@@ -53,7 +53,9 @@ def mode(wanted: str) -> int:
         if wanted not in TRANSIENT_MODES:
             return 0
         asked = time.monotonic()
-        session.spin_until(lambda: states and states[-1].mode_name == wanted, 1.0)
+        began = session.spin_until(lambda: states and states[-1].mode_name == wanted, 1.0)
+        if not began and states and states[-1].mode_name == TRANSIENT_MODES[wanted]:
+            return 0
         session.spin_until(lambda: states and states[-1].mode_name != wanted, MODE_TIMEOUT_S)
         if not states:
             raise NotRunningError(f"controller/state: no message for {MODE_TIMEOUT_S:g} s")

@@ -169,7 +169,7 @@ class Controller(Node):
 
     def _on_enable_walking(self, request: Any, response: Any) -> Any:
         response.success, response.message = self._supervisor.enable_walking(request.data)
-        self.get_logger().info(f"the operator {'allows' if request.data else 'forbids'} walking")
+        self.get_logger().info(f"{'allow' if request.data else 'forbid'} walking: {response.message}")
         self._log_changes()
         return response
 
