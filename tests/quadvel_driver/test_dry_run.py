@@ -28,7 +28,7 @@ def test_the_last_packet_is_described_leg_by_leg_and_clamped(robot: Robot, packe
     link = Link(robot, packets, dry_run, LinkConfig(), print)
     link.submit(JointCommand(q=np.full(12, -9.0), tau=np.full(12, 1.5), kp=np.full(12, 55.0)))
     lines = dry_run.summary().splitlines()
-    assert lines[0].startswith(f"1 packets would have been sent, the last: mode servo, {begin}")
+    assert lines[0].startswith(f"1 packet would have been sent, the last: mode servo, {begin}")
     lowest = robot.command_lower[3:6]
     assert lines[2] == "  FL: " + "; ".join(
         f"{kind} q {q:+.3f} dq +0.00 tau +1.50 kp 55 kd 0"

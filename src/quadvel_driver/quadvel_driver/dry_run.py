@@ -13,6 +13,7 @@ from typing_extensions import override
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot
 from quadvel_description.state import MODE_SERVO
+from quadvel_nodes.number_text import counted
 
 from .link import Transport, WireFormat
 
@@ -62,7 +63,7 @@ class DryRun(Transport):
         if not self._packet:
             return "no packet yet"
         description = describe_packet(self._packet, self._robot, self._wire)
-        return f"{count} packets would have been sent, the last: {description}"
+        return f"{counted(count, 'packet')} would have been sent, the last: {description}"
 
 
 def describe_packet(packet: bytes, robot: Robot, wire: WireFormat) -> str:
