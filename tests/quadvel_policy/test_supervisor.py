@@ -178,6 +178,7 @@ def test_on_a_robot_the_operator_allows_walking_first(policy: Any) -> None:
     rig.run(0.1, FORWARD)
     assert rig.mode == "stance"
     assert "enable_walking" in rig.supervisor.walk_refusal
+    assert "quadvel enable" in rig.supervisor.walk_refusal
     accepted, sentence = rig.supervisor.request("walk")
     assert not accepted
     assert "enable_walking" in sentence
