@@ -245,3 +245,24 @@ def test_a_run_that_went_on_after_a_reset_was_not_stopped(run: Run) -> None:
     assert "last mode walk" in line
     assert "stopped by" not in line
     assert "joint_too_fast" in line
+
+
+def test_a_walk_after_a_fault_is_examined_though_the_walk_before_it_lacks_its_beginning(run: Run) -> None:
+    assert run.modes is not None
+    names, faults = run.modes.name, run.modes.fault
+    earlier = attrs.evolve(
+        run.modes,
+        name=("walk", "fault", "stance", *names[3:]),
+        fault=("", "joint_too_fast", *faults[2:]),
+    )
+    found = examine(attrs.evolve(run, modes=earlier))
+    assert found.finding is None, found.finding
+    assert not found.skipped
+
+
+def test_causes_that_are_not_examined_for_one_reason_share_a_line(run: Run) -> None:
+    joints_only = attrs.evolve(run, imu=None, estimate=None, modes=None, velocity_command=None, is_own=False)
+    diagnosis = diagnose(Signals(joints_only, None))
+    lines = summary(joints_only, diagnosis).splitlines()
+    assert len(lines) == 2 + len(set(diagnosis.skipped.values()))
+    assert all(any(name in line for line in lines) for name in diagnosis.skipped)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ def summary(run: Run, diagnosis: Diagnosis) -> str:
     lines = [f"{run.name}: {run.duration:.1f} s, {len(run.time)} states, {_fate(run)}"]
     found = diagnosis.finding
     if found is None:
-        lines.append(f"every link holds, and nothing else: {len(diagnosis.held)} causes examined, none found")
+        lines.append(f"every link holds: none of the {len(diagnosis.held)} causes examined was found")
     else:
         begin, end = found.measurement.span
         lines += [
@@ -45,9 +46,11 @@ def summary(run: Run, diagnosis: Diagnosis) -> str:
             f"  what to do: {found.cause.remedy}",
             f"  {len(diagnosis.held)} causes before it hold; later ones were not examined: repair, record and ask again",
         ]
-    lacking = {name: why for name, why in diagnosis.skipped.items() if not why.startswith("after ")}
-    if lacking:
-        lines.append(f"not examined: {', '.join(f'{name} ({why})' for name, why in lacking.items())}")
+    lacking: dict[str, list[str]] = defaultdict(list)
+    for name, why in diagnosis.skipped.items():
+        if not why.startswith("after "):
+            lacking[why].append(name)
+    lines += [f"not examined, because {why}: {', '.join(names)}" for why, names in lacking.items()]
     return "\n".join(lines)
 
 
