@@ -144,7 +144,12 @@ def push(force: tuple[float, float, float], seconds: float, body: str) -> int:
 
     Returns:
         The exit code.
+
+    Raises:
+        ValueError: The force is zero.
     """
+    if not any(force):
+        raise ValueError("the force is 0 N, expected --fx, --fy or --fz")
     x, y, z = force
     wrench = Wrench(force=Vector3(x=x, y=y, z=z))
     return _order_simulator("push", Push, may_retry=False, body=body, wrench=wrench, duration=seconds)
