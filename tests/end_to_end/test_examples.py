@@ -142,6 +142,8 @@ LEFT_OUT = {
     "quadvel up --low-level board": "a board waits for nobody; tests/end_to_end/test_board.py, on a machine with time to spare",
     "quadvel record low_state --seconds 5 --out standing.mcap": "as the other recordings",
     "quadvel up --low-level driver": "needs the robot",
+    "quadvel up --robot go2 --policy none --estimator kalman": "as with --terrain; tests/quadvel_bringup/"
+    "test_preflight.py checks this stack",
     "quadvel run driver --ros-args -p state_rate:=1000": "the same",
     "quadvel up --low-level board --params imu.yaml": "as the board without; test_yaml_examples.py loads the file",
     "quadvel run driver --ros-args -p calibration:=calibration.yaml": "the same",

@@ -16,10 +16,12 @@ quadvel_dds.install()
 import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 
+from quadvel_bringup import cli  # noqa: E402
 from quadvel_bringup.recorder import Recorder  # noqa: E402
 from quadvel_bringup.recording_file import RecordingFile  # noqa: E402
 from quadvel_description.state import JointCommand  # noqa: E402
 from quadvel_driver.calibration import Calibration  # noqa: E402
+from quadvel_driver.find_calibration import CalibrationFit  # noqa: E402
 from quadvel_msgs.msg import LowState  # noqa: E402
 from quadvel_nodes.messages import write_low_state  # noqa: E402
 from quadvel_sim.simulator import Simulator, SimulatorConfig  # noqa: E402
@@ -93,3 +95,23 @@ def test_what_tells_nothing_is_refused_in_one_sentence_and_writes_nothing(
         assert sentence in text
         assert "Traceback" not in text
     assert not file.exists()
+
+
+def test_the_table_shows_the_tilt_that_is_written_with_its_own_standard_error(
+    standing: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    joints = Calibration(np.full(12, 0.001), np.radians([1.66, 0.3]))
+    found = CalibrationFit(
+        estimate=joints,
+        zero_errors=np.full(12, 0.01),
+        mounting_errors=np.radians([0.96, 0.5]),
+        tilt=np.radians([1.85, 0.02]),
+        tilt_errors=np.radians([0.11, 0.12]),
+        calibration=Calibration(imu_mounting=np.radians([1.85, 0.0])),
+        unevenness=0.0,
+    )
+    monkeypatch.setattr("quadvel_bringup.calibrate.fit_calibration", lambda *_: found)
+    with pytest.raises(SystemExit):
+        cli.command("calibrate").main(["--standing", str(standing), "--out", str(tmp_path / "c.yaml")])
+    row = next(line for line in capsys.readouterr().out.splitlines() if "IMU roll" in line)
+    assert [float(word) for word in row.split() if word[-1:].isdigit()] == [1.85, 0.11, 1.85]

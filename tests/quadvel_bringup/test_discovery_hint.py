@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -30,10 +31,11 @@ time.sleep(60.0)
 
 
 @pytest.fixture
-def elsewhere() -> Iterator[subprocess.Popen[str]]:
-    """A node on another domain; its command line names it as `quadvel up` names its simulator."""
+def elsewhere(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A node on another domain; its command line names it as ROS 2 names a simulator."""
     environment = {**os.environ, "ROS_DOMAIN_ID": str(ELSEWHERE)}
-    command = [sys.executable, "-c", ROBOT, "sim_node"]
+    (tmp_path / "sim_node").write_text(ROBOT)
+    command = [sys.executable, str(tmp_path / "sim_node")]
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout
         assert process.stdout.readline() == "ready\n"

@@ -64,6 +64,11 @@ rclpy.shutdown()
 """
 
 
+def test_a_push_without_a_force_is_refused() -> None:
+    with pytest.raises(ValueError, match="--fx"):
+        operator_commands.push((0.0, 0.0, 0.0), 0.2, "trunk")
+
+
 def test_a_robot_that_nobody_simulates_is_not_pushed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "DISCOVERY_TIMEOUT_S", 2.0)
     driver = subprocess.Popen(

@@ -116,3 +116,30 @@ def test_what_is_no_quadruped_with_twelve_joints_is_refused_by_name(
     with pytest.raises(UnsupportedRobotError, match=f"third.xml: {code}: ") as refused:
         _edited(third, (old, new))
     assert refused.value.code == code
+
+
+LEG = """<mujoco><worldbody><body name="shank">
+<joint name="knee" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02"/>{more}
+</body></worldbody></mujoco>"""
+FOREARM = """<body name="forearm" pos="0 0 -0.3">
+<joint name="elbow" axis="0 1 0"/><geom type="sphere" size="0.05"/></body>"""
+
+
+@pytest.mark.parametrize("more", ["", FOREARM])
+def test_a_leg_or_arm_on_a_fixed_base_is_refused_for_its_joints(more: str, tmp_path: Path) -> None:
+    (tmp_path / "leg.xml").write_text(LEG.format(more=more))
+    with pytest.raises(UnsupportedRobotError) as refused:
+        find_robot(tmp_path / "leg.xml")
+    assert refused.value.code == "joint_count"
+
+
+def test_four_legs_without_a_trunk_are_refused_for_their_fixed_base(third: Path) -> None:
+    with pytest.raises(UnsupportedRobotError) as refused:
+        _edited(
+            third,
+            ("<freejoint/>", ""),
+            ('<inertial mass="9" pos="0.01 0 0" diaginertia="0.06 0.25 0.28"/>', ""),
+            ('<body name="torso" pos="0 0 0.6">', "<frame>"),
+            ("</body>\n  </worldbody>", "</frame>\n  </worldbody>"),
+        )
+    assert refused.value.code == "fixed_base"

@@ -142,6 +142,14 @@ def test_a_leaning_imu_is_not_taken_for_joints_that_are_off() -> None:
     np.testing.assert_allclose(found.calibration.imu_mounting, LEANING.imu_mounting, atol=0.2 * DEGREE)
 
 
+def test_a_leaning_imu_of_a_suspended_robot_is_found_for_encoders_that_are_right() -> None:
+    found = fitted(LEANING, has_stood=False)
+    assert not found.calibration.joint_zeros.any()
+    assert found.tilt_errors[0] < found.mounting_errors[0]
+    assert np.abs(found.tilt - LEANING.imu_mounting)[0] < 3.0 * found.tilt_errors[0]
+    assert found.calibration.imu_mounting[0] == found.tilt[0]
+
+
 def test_an_offset_of_the_measured_torques_is_not_taken_for_joints_that_are_off() -> None:
     right = Samples.from_states(recorded(True, 60.0, Calibration()))
     found = fit_calibration(ALIENGO, attrs.evolve(right, tau=right.tau + 0.03), None)

@@ -36,4 +36,6 @@ def test_an_option_without_effect_is_refused(line: str, option: str, tmp_path: P
     result = CliRunner().invoke(cli.app, ["demo", *line.split(), "--out", str(tmp_path / "out")])
     assert isinstance(result.exception, ValueError)
     assert str(result.exception).startswith(f"{option} belongs to ")
+    kinds = str(result.exception).partition(", not to ")[0]
+    assert kinds.count("demo follow") <= 1
     assert list(tmp_path.iterdir()) == []

@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from quadvel_bringup import cli
+from quadvel_bringup.error_sentence import exit_with_sentence
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_lab.excite import RAMP_S, MotionError, MotionPlayer
 from quadvel_sysid.excitation import FootLifting
@@ -139,3 +141,17 @@ def test_after_a_report_it_says_what_to_record_next(tmp_path: Path) -> None:
     ended = subprocess.run(excite("--after", tmp_path / "report.json"), capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
     assert "quadvel excite creep --seconds 40\n  for coulomb_friction, stribeck_friction" in ended.stdout
+
+
+def test_without_a_robot_it_says_what_to_start_and_ends_with_2(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("quadvel_lab.excite.FIRST_STATE_TIMEOUT_S", 0.2)
+    path = tmp_path / "chirp.mcap"
+    with pytest.raises(SystemExit) as ended, exit_with_sentence("quadvel"):
+        cli.command("excite").main(["chirp", "--low-level", "external", "--out", str(path)])
+    assert ended.value.code == 2
+    message = capsys.readouterr().err
+    assert "quadvel run driver" in message
+    assert "ROS_DOMAIN_ID" in message
+    assert not path.exists()

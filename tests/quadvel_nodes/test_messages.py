@@ -84,3 +84,14 @@ def test_refusals_are_counted_by_topic_with_the_last_reason() -> None:
         "refused low_state": "2, last: too short",
         "refused low_cmd": "1, last: nan",
     }
+
+
+def test_the_refusals_of_the_last_second_are_told_with_their_reason() -> None:
+    refusals = Refusals()
+    assert not refusals.last_second()
+    refusals.add("low_cmd", "q holds nan")
+    text = refusals.last_second()
+    assert text.startswith("1 message ")
+    assert "low_cmd" in text
+    assert "q holds nan" in text
+    assert not refusals.last_second()

@@ -178,6 +178,7 @@ def test_on_a_robot_the_operator_allows_walking_first(policy: Any) -> None:
     rig.run(0.1, FORWARD)
     assert rig.mode == "stance"
     assert "enable_walking" in rig.supervisor.walk_refusal
+    assert "quadvel enable" in rig.supervisor.walk_refusal
     accepted, sentence = rig.supervisor.request("walk")
     assert not accepted
     assert "enable_walking" in sentence
@@ -191,6 +192,24 @@ def test_on_a_robot_the_operator_allows_walking_first(policy: Any) -> None:
     rig.tick(FORWARD)
     assert rig.mode == "walk"
     np.testing.assert_array_equal(rig.supervisor.command, STILL)
+
+
+def test_a_simulated_robot_cannot_be_forbidden_to_walk_and_says_so(rig: Rig) -> None:
+    rig.stand()
+    accepted, sentence = rig.supervisor.enable_walking(False)
+    assert not accepted
+    assert "needs no permission" in sentence
+    rig.tick(STILL)
+    rig.tick(FORWARD)
+    assert rig.mode == "walk"
+    assert rig.supervisor.enable_walking(True)[0]
+
+
+def test_a_robot_in_stance_that_is_asked_to_stand_up_stays_there(rig: Rig) -> None:
+    rig.stand()
+    assert rig.supervisor.request("stand_up")[0]
+    rig.tick(STILL)
+    assert rig.mode == "stance"
 
 
 def test_the_permission_to_walk_ends_with_passive_and_with_a_fault(policy: Any) -> None:

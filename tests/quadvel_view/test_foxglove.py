@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -87,6 +88,11 @@ server.close()
 def test_other_hosts_are_refused_as_nobody_shows_a_token_here() -> None:
     with pytest.raises(AddressError, match=r"this computer only.*ssh -L"):
         foxglove_live.FoxgloveServer("0.0.0.0", 0)
+
+
+def test_a_port_that_is_taken_names_the_option_for_another_one() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(AddressError, match="--port"):
+        foxglove_live.FoxgloveServer("127.0.0.1", taken.getsockname()[1])
 
 
 def test_the_layout_shows_the_robot_by_its_description() -> None:

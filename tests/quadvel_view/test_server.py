@@ -208,7 +208,7 @@ def test_elsewhere_only_the_token_lets_in(everywhere: PageServer) -> None:
 def test_a_port_that_is_taken_is_told_in_one_sentence(here: PageServer) -> None:
     port = urlsplit(here.url).port
     assert port is not None
-    with pytest.raises(AddressError, match=rf"127.0.0.1:{port}: cannot serve the page"):
+    with pytest.raises(AddressError, match=rf"127.0.0.1:{port}: cannot serve the page: .*--port"):
         PageServer("127.0.0.1", port, NOWHERE, lambda page, word: None, lambda page: None)
 
 

@@ -18,7 +18,8 @@ from quadvel_why.links import CAUSES
 from quadvel_why.links.drives import SpeedTorqueLimit, TorqueLimit
 from quadvel_why.page import page
 from quadvel_why.reading import read_run
-from quadvel_why.run import Commands, Run
+from quadvel_why.report import summary
+from quadvel_why.run import Commands, Modes, Run
 from quadvel_why.signals import PARTS, Signals
 from tests.helpers.robots import ALIENGO
 from tests.quadvel_policy.test_imported import MJLAB, import_policy, write_network
@@ -175,6 +176,17 @@ def test_the_command_writes_the_finding_and_ends_with_1(run: Run, tmp_path: Path
     assert (tmp_path / "out" / "why.png").stat().st_size > 1000
 
 
+def test_a_table_with_other_names_is_read_by_a_column_map(run: Run, tmp_path: Path) -> None:
+    now = np.maximum(run.command_rows(0.0), 0)
+    np.savez(tmp_path / "bench.npz", t=run.time, angles=run.q, dq=run.dq, goal=run.commands.q[now])
+    (tmp_path / "map.yaml").write_text("q: angles\nq_des: goal\n")
+    arguments = [str(tmp_path / "bench.npz"), "--gains", "30", "0.5", "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit) as ended:
+        cli.command("why").main([*arguments, "--columns", str(tmp_path / "map.yaml")])
+    assert ended.value.code in (0, 1)
+    assert (tmp_path / "out/why.json").exists()
+
+
 @pytest.mark.parametrize("policy", ["none", "imported.onnx"])
 def test_without_a_policy_to_replay_the_other_causes_are_examined(
     policy: str,
@@ -213,3 +225,44 @@ def test_lost_states_are_no_jump_of_the_angle(run: Run) -> None:
     whole, jumps = Signals(run, None).jumps, Signals(lost, None).jumps
     assert not jumps[[199, 296]].any()
     assert np.abs(jumps).max() <= np.abs(whole).max()
+
+
+def headline(run: Run, modes: list[str], faults: list[str]) -> str:
+    """The first line of the answer for a run with these reports of the controller."""
+    reported = attrs.evolve(run, modes=Modes(np.arange(len(modes)) * 0.1, tuple(modes), tuple(faults)))
+    return summary(reported, Diagnosis(None, {}, {})).splitlines()[0]
+
+
+def test_a_run_is_stopped_by_its_last_fault(run: Run) -> None:
+    line = headline(run, ["walk", "stance", "fault"], ["", "accelerometer_implausible", "joint_too_fast"])
+    assert "stopped by joint_too_fast" in line
+    assert "accelerometer_implausible" not in line
+
+
+def test_a_run_that_went_on_after_a_reset_was_not_stopped(run: Run) -> None:
+    modes = ["walk", "stance", "fault", "passive", "stand_up", "walk"]
+    line = headline(run, modes, ["", "accelerometer_implausible", "joint_too_fast", "", "", ""])
+    assert "last mode walk" in line
+    assert "stopped by" not in line
+    assert "joint_too_fast" in line
+
+
+def test_a_walk_after_a_fault_is_examined_though_the_walk_before_it_lacks_its_beginning(run: Run) -> None:
+    assert run.modes is not None
+    names, faults = run.modes.name, run.modes.fault
+    earlier = attrs.evolve(
+        run.modes,
+        name=("walk", "fault", "stance", *names[3:]),
+        fault=("", "joint_too_fast", *faults[2:]),
+    )
+    found = examine(attrs.evolve(run, modes=earlier))
+    assert found.finding is None, found.finding
+    assert not found.skipped
+
+
+def test_causes_that_are_not_examined_for_one_reason_share_a_line(run: Run) -> None:
+    joints_only = attrs.evolve(run, imu=None, estimate=None, modes=None, velocity_command=None, is_own=False)
+    diagnosis = diagnose(Signals(joints_only, None))
+    lines = summary(joints_only, diagnosis).splitlines()
+    assert len(lines) == 2 + len(set(diagnosis.skipped.values()))
+    assert all(any(name in line for line in lines) for name in diagnosis.skipped)

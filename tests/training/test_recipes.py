@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import attrs
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from quadvel_actuator import ActuatorModel
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_training import loop, recipe, stages
+from quadvel_training.__main__ import main
 from quadvel_training.constrained import ConstrainedConfig
 from quadvel_training.dagger import DaggerConfig
 from quadvel_training.estimator import EstimatorConfig
@@ -145,3 +149,18 @@ def test_the_ablation_gives_every_recipe_the_same_budget_and_resumes(tmp_path, m
     shares = own.pull_samples / own.budget.samples, own.constraint_samples / own.budget.samples
     same = (100.0, 64, 7, *np.round(shares, 9))
     assert runs == [(name, "start.pt", "teacher.pt", same, name) for name in order]
+
+
+def test_a_recipe_that_does_not_exist_is_named_in_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe_file = tmp_path / "nofile.yaml"
+    monkeypatch.setattr(sys, "argv", ["quadvel_training", "privileged", "--recipe", str(recipe_file)])
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("torch.set_num_threads", lambda count: None)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert str(recipe_file) in said
+    assert "Errno" not in said

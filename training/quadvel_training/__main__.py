@@ -371,13 +371,17 @@ def main() -> None:
     """Run the program; errors in files are printed in one sentence.
 
     Raises:
-        SystemExit: a recipe, checkpoint or other file is wrong or missing.
+        SystemExit: a recipe, checkpoint or other file is wrong or missing; exit code 2.
     """
     torch.set_num_threads(env.available_cores())
     try:
         app()
     except (recipe.RecipeError, loop.CheckpointError, FileNotFoundError) as error:
-        raise SystemExit(f"quadvel_training: {error}") from None
+        missing = isinstance(error, FileNotFoundError) and error.filename
+        print(
+            f"quadvel_training: {f'{missing}: there is no such file' if missing else error}", file=sys.stderr
+        )
+        raise SystemExit(2) from None
 
 
 if __name__ == "__main__":

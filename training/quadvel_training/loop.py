@@ -11,17 +11,23 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Protocol
 
 import attrs
 import torch
-from rich.progress import Progress, TextColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from torch.utils.tensorboard import SummaryWriter
 
 from . import process_group
 
 SAVE_INTERVAL_S = 60.0
+HEADLINES = ("followed", "error_xy", "error_wz", "falls_per_minute")
+"""Figures that the progress line shows first, because it has room for a few only."""
+BAR_WIDTH = 10
+PROGRESS_WIDTH = BAR_WIDTH + len(" 100%") + len(" -:--:--") + 2
+"""Characters of the progress line apart from the run's name and its figures."""
 
 
 class CheckpointError(ValueError):
@@ -297,7 +303,13 @@ class _Journal:
         self._before, self._first = seconds, run.samples
         self._started = self._saved = time.monotonic()
         self._curves = SummaryWriter(str(checkpoint.parent))
-        self._progress = Progress(*Progress.get_default_columns(), TextColumn("{task.fields[note]}"))
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(BAR_WIDTH),
+            TaskProgressColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
+        )
         self._task = self._progress.add_task(checkpoint.stem, total=1.0, note="")
         self._progress.start()
 
@@ -308,16 +320,16 @@ class _Journal:
             seen = seen | self._keeper.keep()
         for key, value in seen.items():
             self._curves.add_scalar(f"{self._checkpoint.stem}/{key}", value, samples)
-        shown = {key: value for key, value in seen.items() if "/" not in key}  # the others are plotted
-        note = "  ".join(f"{key} {value:.3g}" for key, value in shown.items())
-        self._progress.update(self._task, completed=done, note=note)
+        shown = _figures(seen)
+        width = self._progress.console.width - PROGRESS_WIDTH - len(self._checkpoint.stem)
+        self._progress.update(self._task, completed=done, note=_first_that_fit(shown, width))
         now = time.monotonic()
         if now - self._saved > SAVE_INTERVAL_S:
             self.save()
             self._saved = now
             rate = (samples - self._first) / (now - self._started)
             self._progress.console.print(
-                f"{samples / 1e6:.2f} M samples, {rate:.0f}/s  {note}", soft_wrap=True
+                f"{samples / 1e6:.2f} M samples, {rate:.0f}/s  {'  '.join(shown)}", soft_wrap=True
             )
 
     def save(self) -> None:
@@ -329,3 +341,15 @@ class _Journal:
         """Close progress bar and curves."""
         self._progress.stop()
         self._curves.close()
+
+
+def _figures(seen: dict[str, float]) -> list[str]:
+    """Return the figures of an update with their names, HEADLINES first; those with a "/" are only plotted."""
+    names = [*(name for name in HEADLINES if name in seen), *(name for name in seen if name not in HEADLINES)]
+    return [f"{name} {seen[name]:.3g}" for name in names if "/" not in name]
+
+
+def _first_that_fit(figures: list[str], width: int) -> str:
+    """Join the first figures that fit into a width, characters."""
+    lengths = accumulate(len(figure) + 2 for figure in figures)
+    return "  ".join(figure for figure, length in zip(figures, lengths, strict=True) if length - 2 <= width)

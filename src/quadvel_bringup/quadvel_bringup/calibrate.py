@@ -125,7 +125,10 @@ def _findings(found: CalibrationFit, has_stood: bool) -> Iterator[str]:
         roll, pitch = np.degrees(written.imu_mounting)
         yield f"IMU: tilted by {roll:+.2f} degrees to the right and {pitch:+.2f} degrees forward"
     if not np.isnan(found.zero_errors).any() and not written.joint_zeros.any():
-        yield "Joints: chance explains all estimates; the file does not correct the encoders"
+        yield (
+            "Joints: chance explains all estimates; the file does not correct the encoders, "
+            "and the IMU's tilt is estimated for encoders that are right"
+        )
     if not written.imu_mounting.any():
         yield "IMU: no significant tilt; the file does not correct it"
     if not has_stood:
@@ -144,8 +147,8 @@ def _table(found: CalibrationFit) -> Table:
     columns = (
         np.degrees(np.concatenate(pair))
         for pair in (
-            (found.estimate.joint_zeros, found.estimate.imu_mounting),
-            (found.zero_errors, found.mounting_errors),
+            (found.estimate.joint_zeros, found.tilt),
+            (found.zero_errors, found.tilt_errors),
             (found.calibration.joint_zeros, found.calibration.imu_mounting),
         )
     )

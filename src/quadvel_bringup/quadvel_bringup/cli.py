@@ -458,7 +458,7 @@ def enable(
 ) -> None:
     """Permit or forbid walking.
 
-    Real robots require the permission; a simulated one does not.
+    Real robots require the permission. A simulated one does not, and --off has no effect: exit code 1.
     """
     raise typer.Exit(_with_middleware("operator_commands").enable(on))
 

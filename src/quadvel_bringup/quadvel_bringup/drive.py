@@ -21,7 +21,7 @@ from quadvel_nodes.number_text import number_text
 
 from .operator_commands import MODE_TIMEOUT_S, RECOVERY_HINT, START_HINT
 from .processes import StopSignals
-from .session import DISCOVERY_TIMEOUT_S, Session
+from .session import DISCOVERY_TIMEOUT_S, Session, not_running
 
 PUBLISH_PERIOD_S = 0.05
 """Time between two messages; the command mux drops a source after 0.5 s."""
@@ -64,9 +64,9 @@ class DriveRun:
             NotRunningError: There is no command mux or no controller.
         """
         if not self._wait(self._publisher.get_subscription_count, DISCOVERY_TIMEOUT_S):
-            raise self._session.not_running(f"{self._topic}: no subscriber; {START_HINT}")
+            raise not_running(self._session.node, f"{self._topic}: no subscriber; {START_HINT}")
         if not self._wait(lambda: self._states, DISCOVERY_TIMEOUT_S):
-            raise self._session.not_running(f"controller/state: no message; {START_HINT}")
+            raise not_running(self._session.node, f"controller/state: no message; {START_HINT}")
         if self._signals.received:
             return ""
         self._wait(lambda: self._states[-1].mode_name != "stand_up", MODE_TIMEOUT_S)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from quadvel_nodes.publishers import DISCOVERY_TIME_S, has_publisher
 
 TOPIC = "low_state"
 ROBOT_PROGRAMS = ("sim_node", "board", "driver", "quadvel_lab.plant")
-"""Words on the command lines of drivers and simulated robots."""
+"""Nodes and modules of drivers and simulated robots."""
 LOADED_DISCOVERY_TIME_S = 4.0
 """Time to discover other publishers if one of ROBOT_PROGRAMS runs on this machine, which may be busy and answer late."""
 
@@ -64,21 +65,33 @@ def running_robots() -> dict[int, tuple[str, str]]:
     """
     found = {}
     for folder in Path("/proc").glob("[0-9]*"):
-        name = next((word for word in ROBOT_PROGRAMS if word in _words(folder)), None)
+        name = _robot_program(_program(folder))
         environment = _environment(folder) if name and int(folder.name) != os.getpid() else None
         if name and environment is not None:
             found[int(folder.name)] = name.rpartition(".")[2], ros_domain(environment)
     return found
 
 
-def _words(folder: Path) -> list[str]:
-    """Return the command line of a process without folders."""
+def _robot_program(words: list[str]) -> str | None:
+    """Return the robot program that a command line runs, if any: by ROS 2, by `quadvel run` or as a module."""
+    match words:
+        case ["quadvel_bringup.nodes", name, *_] | ["quadvel" | "quadvel_bringup", "run", name, *_]:
+            program = name
+        case _:
+            program = words[0] if words else ""
+    return program if program in ROBOT_PROGRAMS else None
+
+
+def _program(folder: Path) -> list[str]:
+    """Return the command line of a process without folders, and without Python and its options."""
     try:
-        return [
-            word.rpartition("/")[2] for word in (folder / "cmdline").read_text(errors="replace").split("\0")
-        ]
+        line = (folder / "cmdline").read_text(errors="replace").split("\0")
     except OSError:  # the process has ended
         return []
+    words = [word.rpartition("/")[2] for word in line if word]
+    if not words or not words[0].startswith("python"):
+        return words
+    return list(dropwhile(lambda word: word.startswith("-"), words[1:]))
 
 
 def _environment(folder: Path) -> dict[str, str] | None:
@@ -108,8 +121,7 @@ def _started_by(pid: int) -> str:
         parent = Path("/proc") / Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]
     except OSError:
         return ""
-    words = [word for word in _words(parent) if word]
-    for program in ("quadvel", "quadvel_bringup"):
-        if program in words[:-1]:  # so that a word follows
-            return f", started by quadvel {words[words.index(program) + 1]}, pid {parent.name}"
+    match _program(parent):
+        case ["quadvel" | "quadvel_bringup", command, *_]:
+            return f", started by quadvel {command}, pid {parent.name}"
     return ""

@@ -53,7 +53,9 @@ def mode(wanted: str) -> int:
         if wanted not in TRANSIENT_MODES:
             return 0
         asked = time.monotonic()
-        session.spin_until(lambda: states and states[-1].mode_name == wanted, 1.0)
+        began = session.spin_until(lambda: states and states[-1].mode_name == wanted, 1.0)
+        if not began and states and states[-1].mode_name == TRANSIENT_MODES[wanted]:
+            return 0
         session.spin_until(lambda: states and states[-1].mode_name != wanted, MODE_TIMEOUT_S)
         if not states:
             raise NotRunningError(f"controller/state: no message for {MODE_TIMEOUT_S:g} s")
@@ -142,7 +144,12 @@ def push(force: tuple[float, float, float], seconds: float, body: str) -> int:
 
     Returns:
         The exit code.
+
+    Raises:
+        ValueError: The force is zero.
     """
+    if not any(force):
+        raise ValueError("the force is 0 N, expected --fx, --fy or --fz")
     x, y, z = force
     wrench = Wrench(force=Vector3(x=x, y=y, z=z))
     return _order_simulator("push", Push, may_retry=False, body=body, wrench=wrench, duration=seconds)

@@ -70,7 +70,8 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
         path.unlink()
         sought = ", ".join(wanted) or "any topic"
         console.print(
-            f"no message on {sought} on ROS domain {ros_domain()}; {path} was not written; is a robot running?"
+            f"no message on {sought} on ROS domain {ros_domain()}; {path} was not written; "
+            "is a robot running, and its simulator not paused?"
         )
         return 0
     for topic in wanted:

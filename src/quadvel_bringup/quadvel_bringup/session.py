@@ -38,6 +38,19 @@ class NotRunningError(ConnectionError):
     """A required node does not run or does not answer; the message says what is missing."""
 
 
+def not_running(node: Any, text: str) -> NotRunningError:
+    """Return the error for a missing peer, with likely causes.
+
+    Args:
+        node: The node that misses it.
+        text: What is missing.
+
+    Returns:
+        The error; it lists type conflicts and other ROS domains.
+    """
+    return NotRunningError("; ".join([text, *map(str, all_conflicts(node)), discovery_hint()]))
+
+
 class Session:
     """A node with an executor; both exist inside the `with` block only.
 
@@ -112,17 +125,6 @@ class Session:
         """
         self.spin_until(lambda: False, seconds)
 
-    def not_running(self, text: str) -> NotRunningError:
-        """Return the error for a missing peer, with likely causes.
-
-        Args:
-            text: What is missing.
-
-        Returns:
-            The error; it lists type conflicts and other ROS domains.
-        """
-        return NotRunningError("; ".join([text, *map(str, all_conflicts(self.node)), discovery_hint()]))
-
     def call(
         self,
         kind: Any,
@@ -152,7 +154,7 @@ class Session:
         if not self.spin_until(
             lambda: any(client.service_is_ready() for client in clients), DISCOVERY_TIMEOUT_S
         ):
-            raise self.not_running(f"{' or '.join(services)}: service not available; {absent()}")
+            raise not_running(self.node, f"{' or '.join(services)}: service not available; {absent()}")
         client = next(client for client in clients if client.service_is_ready())
         asked: list[Any] = []
         for wait in (

@@ -31,7 +31,7 @@ from quadvel_view.operator import PUBLISH_PERIOD_S, Operator
 from .drive import twist_to_array, velocity_text
 from .operator_commands import START_HINT
 from .processes import StopSignals
-from .session import DISCOVERY_TIMEOUT_S, Session
+from .session import DISCOVERY_TIMEOUT_S, Session, not_running
 
 MODE_KEYS = {"u": "stand_up", "x": "lie_down"}
 HOLDER_ID = "hand"
@@ -97,7 +97,7 @@ class Teleop:
         if not self._session.spin_until(
             lambda: self._states and self._set_mode.service_is_ready(), DISCOVERY_TIMEOUT_S
         ):
-            raise self._session.not_running(f"controller/state: no message; {START_HINT}")
+            raise not_running(self._session.node, f"controller/state: no message; {START_HINT}")
 
     def execute(self, order: str) -> None:
         """Execute an order.

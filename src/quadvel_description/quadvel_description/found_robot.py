@@ -144,8 +144,9 @@ def _compile(path: Path) -> mujoco.MjModel:
         spec.delete(mesh)
     for body in spec.bodies[1:]:
         _refuse_impossible_inertia(path, body)
-    if not any(joint.type == _FREE for joint in spec.joints) and spec.worldbody.bodies:
-        spec.worldbody.bodies[0].add_freejoint()
+    roots = spec.worldbody.bodies
+    if roots and not roots[0].joints and not any(joint.type == _FREE for joint in spec.joints):
+        roots[0].add_freejoint()
     try:
         return spec.compile()
     except ValueError as error:
@@ -250,6 +251,8 @@ class _Finder:
         self._trunk = self.model.body_weldid[
             self.model.body_parentid[self.model.body_weldid[self.model.jnt_bodyid[chains[0][0]]]]
         ]
+        if self._trunk == 0:
+            raise self.refusal("fixed_base", "found legs on the world, expected a trunk that moves freely")
 
     def _match_legs(self, chains: list[list[int]]) -> dict[str, list[int]]:
         """Match chains to legs by the places of their knees."""

@@ -12,6 +12,8 @@ from typing_extensions import override
 
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot
+from quadvel_description.state import MODE_SERVO
+from quadvel_nodes.number_text import counted
 
 from .link import Transport, WireFormat
 
@@ -61,11 +63,14 @@ class DryRun(Transport):
         if not self._packet:
             return "no packet yet"
         description = describe_packet(self._packet, self._robot, self._wire)
-        return f"{count} packets would have been sent, the last: {description}"
+        return f"{counted(count, 'packet')} would have been sent, the last: {description}"
 
 
 def describe_packet(packet: bytes, robot: Robot, wire: WireFormat) -> str:
-    """Describe a command packet: its first and last bytes, and one line per leg.
+    """Describe a command packet: its mode, its first and last bytes, and one line per leg.
+
+    The mode is `servo` if the drives follow targets, and `damping` if they only brake: in the board's
+    damping mode, or with kp 0.
 
     Angles (rad) are those of the drives: joint angle plus `joint_zeros` of the calibration, clamped
     for the board. Speeds are in rad/s, torques in N m.
@@ -79,9 +84,9 @@ def describe_packet(packet: bytes, robot: Robot, wire: WireFormat) -> str:
         Several lines of text.
     """
     command = wire.decode_command(packet)
-    lines = [
-        f"{len(packet)} bytes, {packet[:SHOWN_BYTES].hex()} ... CRC 0x{int.from_bytes(packet[-4:], 'little'):08X}"
-    ]
+    mode = "servo" if command.mode == MODE_SERVO and command.kp.any() else "damping"
+    crc = int.from_bytes(packet[-4:], "little")
+    lines = [f"mode {mode}, {len(packet)} bytes, {packet[:SHOWN_BYTES].hex()} ... CRC 0x{crc:08X}"]
     legs: dict[str, list[str]] = {}
     for i, joint in enumerate(JOINT_NAMES):
         leg, _, kind = joint.removesuffix("_joint").partition("_")

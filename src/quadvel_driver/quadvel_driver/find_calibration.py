@@ -74,11 +74,14 @@ class CalibrationFit:
     """Result of a calibration.
 
     Attributes:
-        estimate: All offsets as estimated.
+        estimate: All offsets, estimated together.
         zero_errors: Standard errors of the joint zeros, (12,), rad; NaN if they were not estimated.
-        mounting_errors: Standard errors of the IMU's tilt, (2,), rad.
-        calibration: The correction to apply: all of `estimate` if the zeros together are significant; else
-            the IMU's tilt for encoders that are right, if it is significant.
+        mounting_errors: Standard errors of the IMU's tilt in `estimate`, (2,), rad.
+        tilt: The IMU's tilt for the zeros that `calibration` corrects, (2,), rad: that of `estimate`, or
+            estimated again from the same records for encoders that are right.
+        tilt_errors: Standard errors of `tilt`, (2,), rad.
+        calibration: The correction to apply: all of `estimate` if the zeros together are significant;
+            else `tilt`, if it is significant.
         unevenness: Largest distance of a foot from the plane of the feet, m; NaN without a standing
             record.
     """
@@ -86,6 +89,8 @@ class CalibrationFit:
     estimate: Calibration
     zero_errors: Array
     mounting_errors: Array
+    tilt: Array
+    tilt_errors: Array
     calibration: Calibration
     unevenness: float
 
@@ -107,34 +112,36 @@ def fit_calibration(robot: Robot, suspended: Samples | None, standing: Samples |
     problem = _Problem.from_records(robot, suspended, standing)
     free = np.arange(_SENSORS) >= (12 if suspended is None else 0)
     estimate, covariance = problem.solve(free)
-    calibration = _as_calibration(_significant(problem, estimate, covariance))
     errors = np.where(free, np.sqrt(np.diag(covariance)), np.nan)
+    written, chosen, chosen_errors = estimate, estimate, errors
+    if not _zeros_are_significant(estimate, covariance):
+        chosen, covariance = problem.solve(np.arange(_SENSORS) >= 12)
+        chosen_errors = np.sqrt(np.diag(covariance))
+        written = np.where(np.abs(chosen) >= SIGNIFICANT_ERRORS * chosen_errors, chosen, 0.0)
+    calibration = _as_calibration(written)
     return CalibrationFit(
         estimate=_as_calibration(estimate),
         zero_errors=errors[:12],
         mounting_errors=errors[_MOUNTING],
+        tilt=chosen[_MOUNTING],
+        tilt_errors=chosen_errors[_MOUNTING],
         calibration=calibration,
         unevenness=float("nan") if problem.stand is None else problem.stand.unevenness(calibration),
     )
 
 
-def _significant(problem: _Problem, estimate: Array, covariance: Array) -> Array:
-    """Return the zeros and the mounting to correct, (14,), rad.
+def _zeros_are_significant(estimate: Array, covariance: Array) -> bool:
+    """Return whether chance does not explain the zeros: a Wald test of all twelve together.
 
-    The zeros are tested together (Wald). Significant ones are all corrected: their errors depend on
-    each other, and a hip that is left off would shift the other three. Otherwise the encoders count
-    as right, and the IMU is estimated again.
+    Significant zeros are all corrected: their errors depend on each other, and a hip that is left off
+    would shift the other three.
 
     Args:
-        problem: The records.
         estimate: All zeros and the mounting, (14,), rad.
         covariance: Their covariance, (14, 14), rad^2; 0 for those that are not estimated.
     """
     zeros, spread = estimate[:12], covariance[:12, :12]
-    if spread.any() and zeros @ np.linalg.solve(spread, zeros) > chi2.isf(MAX_CHANCE, 12):
-        return estimate
-    mounting, covariance = problem.solve(np.arange(_SENSORS) >= 12)
-    return np.where(np.abs(mounting) >= SIGNIFICANT_ERRORS * np.sqrt(np.diag(covariance)), mounting, 0.0)
+    return bool(spread.any() and zeros @ np.linalg.solve(spread, zeros) > chi2.isf(MAX_CHANCE, 12))
 
 
 def _as_calibration(sensors: Array) -> Calibration:

@@ -14,6 +14,7 @@ import numpy as np
 from quadvel_description.arrays import Bools
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot
+from quadvel_nodes.number_text import counted
 
 from .board_state import BoardState
 from .link import SILENCE_LIMIT_S, LinkReport
@@ -83,7 +84,7 @@ class Health:
             yield Level.ERROR, f"no state from {self._board} {since}: {reason}"
         elif refusal:
             bad = sum(new[name] for name in BAD_DATAGRAMS)
-            yield Level.WARN, f"{bad} datagrams dropped in the last second, the last: {refusal}"
+            yield Level.WARN, f"{counted(bad, 'datagram')} dropped in the last second, the last: {refusal}"
         if report.takeover:
             yield Level.ERROR, report.takeover
         if new["command_timeouts"]:

@@ -181,13 +181,12 @@ class EstimatorNode(Node):
 
     def _report(self) -> None:
         """Publish /diagnostics about the last second."""
-        count, refused = self._count - self._reported.count, self._refusals.total - self._reported.refused
-        busy = self._busy_s - self._reported.busy
-        self._reported = _ReportedCounts(self._count, self._refusals.total, self._busy_s)
+        count, busy = self._count - self._reported.count, self._busy_s - self._reported.busy
+        self._reported, refused = _ReportedCounts(self._count, self._busy_s), self._refusals.last_second()
         if count == 0:
             level, summary = DiagnosticStatus.WARN, "no valid low_state in the last second"
         elif refused:
-            level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
+            level, summary = DiagnosticStatus.WARN, refused
             self.get_logger().warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
         else:
             level, summary = DiagnosticStatus.OK, "estimating"
@@ -206,10 +205,9 @@ class EstimatorNode(Node):
 
 @attrs.frozen
 class _ReportedCounts:
-    """Counters at the last report: estimates, refused messages, computing time (s)."""
+    """Counters at the last report: estimates, computing time (s)."""
 
     count: int = 0
-    refused: int = 0
     busy: float = 0.0
 
 

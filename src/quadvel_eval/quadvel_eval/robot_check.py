@@ -114,7 +114,7 @@ def describe_joints(found: FoundRobot) -> str:
         f"{found.name or found.path.name}: {found.mass:.2f} kg, 12 joints, "
         f"{int(np.isfinite(found.foot_radii).sum())} feet, IMU {'missing' if found.imu is None else 'found'}",
         f"{'joint':15} {'in the file':24} {'no.':>3} axis {'lower rad':>9} {'upper rad':>9} "
-        f"{'torque Nm':>9} {'speed 1/s':>9}",
+        f"{'torque Nm':>9} {'speed rad/s':>11}",
     ]
     for joint in found.joints:
         axis = ("-" if joint.sign < 0 else "+") + ("x" if "hip" in joint.name else "y")

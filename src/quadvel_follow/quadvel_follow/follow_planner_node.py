@@ -39,7 +39,7 @@ class FollowPlannerNode(Node):
     def __init__(self) -> None:
         super().__init__("follow_planner")
         self._planner = FollowPlanner(read_parameters(self, FollowConfig))
-        self._refusals, self._refused_before = Refusals(), 0
+        self._refusals = Refusals()
         self._frame, self._state_text = "", ""
         self._log = StateLog()
         self._plan: Plan | None = None
@@ -130,11 +130,11 @@ class FollowPlannerNode(Node):
 
     def _report(self) -> None:
         """Publish the diagnostics of the last second."""
-        refused, self._refused_before = self._refusals.total - self._refused_before, self._refusals.total
+        refused = self._refusals.last_second()
         level = DiagnosticStatus.OK if self._plan and self._plan.state in OK_STATES else DiagnosticStatus.WARN
         summary = self._state_text or "starts"
         if refused:
-            level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
+            level, summary = DiagnosticStatus.WARN, refused
             self.get_logger().warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
         values = {
             "state": self._plan.state.value if self._plan else "none",

@@ -90,7 +90,7 @@ class PersonTrackerNode(Node):
         self._tracks: list[Track] = []
         self._pose = np.zeros(3)
         self._refusals = Refusals()
-        self._scan_count, self._scan_count_before, self._refused_before = 0, 0, 0
+        self._scan_count = self._scan_count_before = 0
         self._person_message = self.create_publisher(PoseStamped, "person", 10)
         self._odometry = self.create_publisher(Odometry, "person/odometry", 10)
         self._persons = self.create_publisher(Persons, "persons", 10)
@@ -199,13 +199,10 @@ class PersonTrackerNode(Node):
 
     def _report(self) -> None:
         """Publish the diagnostics of the last second."""
-        used, refused = (
-            self._scan_count - self._scan_count_before,
-            self._refusals.total - self._refused_before,
-        )
-        self._scan_count_before, self._refused_before = self._scan_count, self._refusals.total
+        used, self._scan_count_before = self._scan_count - self._scan_count_before, self._scan_count
+        refused = self._refusals.last_second()
         if refused:
-            level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
+            level, summary = DiagnosticStatus.WARN, refused
             self.get_logger().warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
         elif used:
             level, summary = DiagnosticStatus.OK, "tracking"

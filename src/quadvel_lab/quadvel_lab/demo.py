@@ -156,7 +156,8 @@ def _check_options(context: typer.Context, demo: str) -> None:
             and context.params[name] is not False
             and demo not in demos
         ):
-            raise ValueError(f"--{name.replace('_', '-')} belongs to {' and '.join(demos)}, not to {demo}")
+            kinds = (FOLLOW,) if demos == (FOLLOW, TOUR) else demos  # a tour is one of following
+            raise ValueError(f"--{name.replace('_', '-')} belongs to {' and '.join(kinds)}, not to {demo}")
 
 
 def _stack(

@@ -54,6 +54,8 @@ MAX_STATE_GAP_S = 0.05
 """Longest time between two states; after a longer one the motion would jump."""
 ANSWER_TIMEOUT_S = 2.0
 """Time after which the simulator repeats a state."""
+ROBOT_HINT = "start the robot first: its driver, or quadvel run board and quadvel run driver"
+"""Advice if no robot serves low_state."""
 RECORDED_TOPICS = {
     "/low_state": "quadvel_msgs/msg/LowState",
     "/low_cmd": "quadvel_msgs/msg/LowCmd",
@@ -229,7 +231,8 @@ def excite_command(
         _print_proposals(after, console)
         return
     if motion not in EXCITATIONS:
-        raise ValueError(f"motion is {motion!r}, expected one of {', '.join(EXCITATIONS)}")
+        found = "no motion given" if motion is None else f"motion is '{motion}'"
+        raise ValueError(f"{found}, expected one of {', '.join(EXCITATIONS)}")
     chosen = load_robot(robot)
     excitation = EXCITATIONS[motion](chosen, **({} if seconds is None else {"seconds": seconds}))
     path = out or Path("out/excite") / f"{motion}.mcap"
@@ -292,7 +295,8 @@ def record_motion(
         nodes: Command lines by name of the nodes to start; empty for a running robot.
         console: Console for output and bar.
 
-        Errors pass through: MotionError for an aborted motion, typer.Exit after a signal.
+        Errors pass through: MotionError for an aborted motion, NotRunningError without a robot,
+        typer.Exit after a signal.
     """
     quadvel_dds.install()
     import rclpy
@@ -408,6 +412,8 @@ class _Session:
 
     def _check_running(self, group: ProcessGroup, signals: StopSignals) -> None:
         """Raise the error or the exit that ends the motion early."""
+        from quadvel_bringup.session import not_running
+
         if signals.received:
             raise typer.Exit(128 + signals.received)
         if self._failure:
@@ -416,10 +422,13 @@ class _Session:
             raise MotionError(
                 ", ".join(f"{name} ended with exit code {code}" for name, code in ended.items())
             )
-        patience = FIRST_STATE_TIMEOUT_S if self._heard is None else STATE_TIMEOUT_S
-        since = self._started if self._heard is None else self._heard
-        if time.monotonic() - since > patience:
-            raise MotionError(f"no message on low_state for {patience:g} s")
+        now = time.monotonic()
+        if self._heard is None and now - self._started > FIRST_STATE_TIMEOUT_S:
+            raise not_running(
+                self._node, f"low_state: no message for {FIRST_STATE_TIMEOUT_S:g} s; {ROBOT_HINT}"
+            )
+        if self._heard is not None and now - self._heard > STATE_TIMEOUT_S:
+            raise MotionError(f"no message on low_state for {STATE_TIMEOUT_S:g} s")
 
     def _on_state(self, message: Any) -> None:
         """Answer a state."""

@@ -36,7 +36,7 @@ from geometry_msgs.msg import Twist, TwistWithCovarianceStamped
 from quadvel_bringup.exclusivity import ensure_exclusive
 from quadvel_bringup.nodes import ros_arguments
 from quadvel_bringup.processes import ProcessGroup, StopSignals
-from quadvel_bringup.session import Session
+from quadvel_bringup.session import Session, not_running
 from quadvel_bringup.stack import Stack
 from quadvel_description.arrays import Array
 from quadvel_eval.bench import WALK_COMMAND, Benchmark
@@ -214,7 +214,7 @@ class LiveRun:
         return until()
 
     def _not_walking(self) -> Exception:
-        return self._session.not_running(f"the robot does not walk: {'; '.join(self._output[-3:])}")
+        return not_running(self._session.node, f"the robot does not walk: {'; '.join(self._output[-3:])}")
 
 
 def run_figures(

@@ -16,6 +16,8 @@ import numpy as np
 from quadvel_description.arrays import Array
 from quadvel_description.state import JointCommand, RobotState
 
+from .number_text import counted
+
 QUATERNION_TOLERANCE = 0.05
 """Largest accepted deviation of a quaternion's norm from 1."""
 LOW_STATE_SIZES = {
@@ -186,6 +188,7 @@ class Refusals:
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
         self._reasons: dict[str, str] = {}
+        self._latest_topic, self._reported = "", 0
 
     def add(self, topic: str, reason: object) -> None:
         """Count one refused message.
@@ -196,11 +199,24 @@ class Refusals:
         """
         self._counts[topic] += 1
         self._reasons[topic] = str(reason)
+        self._latest_topic = topic
 
     @property
     def total(self) -> int:
         """Number of refused messages on all topics since the start."""
         return self._counts.total()
+
+    def last_second(self) -> str:
+        """Describe the messages that were refused since the last call; to be called at 1 Hz.
+
+        Returns:
+            Their number and the latest reason; "" if none was refused.
+        """
+        new, self._reported = self.total - self._reported, self.total
+        if not new:
+            return ""
+        topic = self._latest_topic
+        return f"{counted(new, 'message')} refused in the last second, the last on {topic}: {self._reasons[topic]}"
 
     def diagnostic_values(self) -> dict[str, str]:
         """Return the counts for /diagnostics.

@@ -1,4 +1,4 @@
-"""Numbers as text: missing and non-finite values are shown as a dash."""
+"""Numbers as text: missing and non-finite values are shown as a dash, counts with their noun."""
 
 from __future__ import annotations
 
@@ -18,3 +18,16 @@ def number_text(value: float | None, spec: str) -> str:
         The text.
     """
     return DASH if value is None or not math.isfinite(value) else format(value, spec)
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, in the plural unless it is one.
+
+    Args:
+        count: The count.
+        noun: The noun, with a regular plural.
+
+    Returns:
+        Such as "1 message" or "2 messages".
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -77,7 +77,7 @@ class CommandMuxNode(Node):
         settings = read_parameters(self, MuxParameters)
         inputs = settings.inputs()
         self._mux = CommandMux(inputs, settings)
-        self._refusals, self._refused_before = Refusals(), 0
+        self._refusals = Refusals()
         self._output: MuxOutput | None = None
         self._message = VelocityCommand()
         kind = TwistStamped if settings.stamped else Twist
@@ -150,11 +150,10 @@ class CommandMuxNode(Node):
 
     def _report(self) -> None:
         """Publish /diagnostics, at 1 Hz."""
-        refused = self._refusals.total - self._refused_before
-        self._refused_before = self._refusals.total
+        refused = self._refusals.last_second()
         source = self._output.source if self._output else "none"
         if refused:
-            level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
+            level, summary = DiagnosticStatus.WARN, refused
         elif self._mux.locks:
             level, summary = DiagnosticStatus.OK, f"locked by {', '.join(sorted(self._mux.locks))}"
         elif self._mux.stance_requested:

@@ -29,7 +29,7 @@ from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.flat_messages import decode_estimate, decode_low_state, encode_low_cmd
 from quadvel_nodes.messages import MessageError, Refusals, read_numbers, seconds
 from quadvel_nodes.node import read_parameters, run
-from quadvel_nodes.number_text import number_text
+from quadvel_nodes.number_text import counted, number_text
 from quadvel_nodes.robot_check import RobotCheck
 from quadvel_nodes.scheduling import Scheduling
 
@@ -84,7 +84,7 @@ class Controller(Node):
             None if self._sim_time else time.monotonic,
         )
         self._refusals = Refusals()
-        self._refused_before = self._overruns_before = self._pauses_before = 0
+        self._overruns_before = self._pauses_before = 0
         self._operator_log = OperatorLog(self._supervisor)
         self._loop_summary = LoopSummary()  # of the last second
         self._reports = self._silent_reports = 0  # total, and since the last low_state
@@ -169,7 +169,7 @@ class Controller(Node):
 
     def _on_enable_walking(self, request: Any, response: Any) -> Any:
         response.success, response.message = self._supervisor.enable_walking(request.data)
-        self.get_logger().info(f"the operator {'allows' if request.data else 'forbids'} walking")
+        self.get_logger().info(f"{'allow' if request.data else 'forbid'} walking: {response.message}")
         self._log_changes()
         return response
 
@@ -261,11 +261,13 @@ class Controller(Node):
 
     def _status(self) -> tuple[bytes, str]:
         """Return diagnostics level and summary of the last second."""
-        refused = self._refusals.total - self._refused_before
+        refused = self._refusals.last_second()
         missed = self._loop.stats.overruns - self._overruns_before
         paused = self._loop.stall_detector.count - self._pauses_before
-        self._refused_before, self._overruns_before = self._refusals.total, self._loop.stats.overruns
-        self._pauses_before = self._loop.stall_detector.count
+        self._overruns_before, self._pauses_before = (
+            self._loop.stats.overruns,
+            self._loop.stall_detector.count,
+        )
         status = f"{self._supervisor.mode}: {self._supervisor.reason}"
         if self._supervisor.fault:
             return DiagnosticStatus.ERROR, status
@@ -276,13 +278,14 @@ class Controller(Node):
         if self._supervisor.findings:
             return DiagnosticStatus.WARN, f"{self._supervisor.findings[0].sentence}; {status}"
         if refused:
-            return DiagnosticStatus.WARN, f"{refused} messages refused in the last second; {status}"
+            return DiagnosticStatus.WARN, f"{refused}; {status}"
         if paused:
-            return DiagnosticStatus.WARN, f"could not run {paused} times in the last second; {status}"
+            stalls = f"the controller's process stalled {counted(paused, 'time')} in the last second"
+            return DiagnosticStatus.WARN, f"{stalls}: this computer was busy or suspended; {status}"
         if not self._loop.stats.summary(time.perf_counter()).rate_hz:
             return DiagnosticStatus.WARN, f"no state came for a second; {status}"
         if missed:
-            return DiagnosticStatus.WARN, f"{missed} deadlines missed in the last second; {status}"
+            return DiagnosticStatus.WARN, f"{counted(missed, 'deadline')} missed in the last second; {status}"
         return DiagnosticStatus.OK, status
 
 

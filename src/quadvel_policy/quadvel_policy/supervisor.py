@@ -159,6 +159,9 @@ class Supervisor:
         The robot ignores a velocity that is commanded at that moment: a zero velocity must come
         first.
 
+        A controller without `require_operator`, as that of a simulated robot, needs no permission: it
+        refuses to forbid walking.
+
         Args:
             enabled: Whether walking is allowed.
 
@@ -166,6 +169,8 @@ class Supervisor:
             Whether the request was accepted, and a sentence.
         """
         now = self._situation
+        if not self._config.require_operator:
+            return enabled, "this robot needs no permission to walk; nothing was changed"
         if enabled and not now.is_walking_allowed:
             now.neutral_seen = False
         now.walking_enabled = enabled
@@ -175,7 +180,7 @@ class Supervisor:
         """Request a mode.
 
         "passive" is always accepted and clears a fault. "stance" clears the stop of a robot that
-        stands, if its cause is gone.
+        stands, if its cause is gone. "stand_up" of a robot in stance changes nothing.
 
         Args:
             mode: One of MODES, except "fault".
@@ -184,6 +189,8 @@ class Supervisor:
             Whether the request was accepted, and a sentence.
         """
         now = self._situation
+        if (now.mode, mode) == ("stance", "stand_up"):
+            return True, "the robot stands already"
         if refusal := request_refusal(mode, now):
             return False, refusal
         now.auto_stand = False

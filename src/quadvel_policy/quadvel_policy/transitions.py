@@ -145,7 +145,11 @@ def _require_policy(now: Situation) -> str:
 
 def _require_permission_to_walk(now: Situation) -> str:
     """Walking is allowed."""
-    return "" if now.is_walking_allowed else "walking is not allowed yet: call ~/enable_walking"
+    return (
+        ""
+        if now.is_walking_allowed
+        else "walking is not allowed yet: quadvel enable (service ~/enable_walking) allows it"
+    )
 
 
 def _require_zero_command_seen(now: Situation) -> str:

@@ -17,6 +17,7 @@ from quadvel_description.state import RobotState
 from quadvel_driver.board_state import Button, Remote
 from quadvel_driver.unitree_dds.bus import Bus
 from quadvel_nodes.node import run
+from quadvel_nodes.number_text import counted
 from quadvel_sim.board import Board
 from quadvel_sim.dds_board import DdsBoard
 from quadvel_sim.loop import LoopReport
@@ -57,7 +58,9 @@ class BoardNode(SimulationNode[BoardParameters]):
     def warning_text(self, report: LoopReport) -> str:
         refused = sum(count for name, count in self._board.counts.items() if name != "commands")
         new, self._refused_before = refused - self._refused_before, refused
-        return f"{new} packets dropped in the last second: {self._board.last_refusal}" if new else ""
+        if not new:
+            return ""
+        return f"{counted(new, 'packet')} dropped in the last second, the last: {self._board.last_refusal}"
 
     def _on_remote(self, message: Any) -> None:
         """Use axes and buttons of a joystick as the state of the wireless remote."""

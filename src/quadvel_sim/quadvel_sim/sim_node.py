@@ -35,7 +35,7 @@ class SimNode(SimulationNode[SimParameters]):
         """
         super().__init__("sim_node", SimParameters, make_simulator)
         self._refusals = Refusals()
-        self._refused_before = self._unanswered_before = 0
+        self._unanswered_before = 0
         self._low_state = self.create_publisher(LowState, "low_state", 10)
         self._waiting = self.create_publisher(Waiting, "waiting", 1)
         self._clock_publisher = self.create_publisher(ClockMessage, "/clock", 10)
@@ -67,11 +67,10 @@ class SimNode(SimulationNode[SimParameters]):
 
     @override
     def warning_text(self, report: LoopReport) -> str:
-        refused = self._refusals.total - self._refused_before
         unanswered = report.unanswered - self._unanswered_before
-        self._refused_before, self._unanswered_before = self._refusals.total, report.unanswered
-        if refused:
-            return f"{refused} messages refused in the last second"
+        self._unanswered_before = report.unanswered
+        if refused := self._refusals.last_second():
+            return refused
         return "waiting for the LowCmd that answers the last state" if unanswered else ""
 
     def _on_command(self, data: bytes) -> None:

@@ -274,7 +274,9 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         if slow := self._slowness.next_line(monotonic(), report.given_up):
             self.get_logger().warning(slow)
         if report.fallen and not self._has_fallen:
-            self.get_logger().warning("the robot has fallen, or lies down: ~/reset puts it back")
+            self.get_logger().warning(
+                "the robot has fallen, or lies down: quadvel reset (service ~/reset) puts it back"
+            )
         self._has_fallen = report.fallen
 
     def _world_values(self, report: LoopReport) -> dict[str, object]:

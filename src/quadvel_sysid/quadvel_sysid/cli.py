@@ -191,7 +191,6 @@ def identify(
         if found.report["withheld"]:
             raise typer.Exit(WITHHELD_EXIT_CODE)
     except KeyboardInterrupt:
-        messages.print("stopped; nothing was written")
         raise typer.Exit(130) from None
 
 

@@ -52,7 +52,8 @@ class FoxgloveServer:
                 name="quadvel", host=host, port=port, context=self._context, server_listener=_Latch(self)
             )
         except Exception as error:
-            raise AddressError(f"{host}:{port}: cannot serve the topics: {error}") from None
+            advice = "; --port selects another one" if "in use" in str(error) else ""
+            raise AddressError(f"{host}:{port}: cannot serve the topics: {error}{advice}") from None
         self.url = f"ws://{host}:{self._server.port}"
 
     def offer(self, topic: str, typename: str, latched: bool = False) -> None:

@@ -12,6 +12,7 @@ set it.
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import logging
 import secrets
@@ -210,6 +211,8 @@ class PageServer:
                 await self._stop.wait()
         except (OSError, OverflowError, UnicodeError) as error:  # the latter two: invalid port or host name
             reason = getattr(error, "strerror", None) or error
+            if getattr(error, "errno", None) == errno.EADDRINUSE:
+                reason = "another program uses this port; --port selects another one"
             self._error = f"{self._host}:{self._port}: cannot serve the page: {reason}"
         finally:
             self._ready.set()

@@ -8,9 +8,12 @@ from typing import Annotated
 
 import typer
 
+from quadvel_eval.recording_plot import CommandTopicOption, StateTopicOption
 from quadvel_policy.imported.policy import ImportedPolicy
 from quadvel_policy.policy_file import chosen_policy
 from quadvel_recordings.output import atomic_write, output_folder
+from quadvel_sysid.logs.readers.columns import ColumnMap
+from quadvel_sysid.logs.readers.recordings import Topics
 
 from .diagnosis import diagnose
 from .reading import read_run
@@ -53,6 +56,16 @@ def why_command(
             show_default="none",
         ),
     ] = None,
+    columns: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="<file>",
+            help="YAML file that maps the names of a table to fields, as for `quadvel identify`.",
+            show_default="names as in docs/identification.md",
+        ),
+    ] = None,
+    state_topic: StateTopicOption = None,
+    command_topic: CommandTopicOption = None,
 ) -> None:
     """Find out why a recorded run failed: the first link of the chain that breaks.
 
@@ -77,7 +90,8 @@ def why_command(
       2  a wrong argument or file
     """
     output_folder(out)
-    run = read_run(recording, gains, robot)
+    names = None if columns is None else ColumnMap.load(columns)
+    run = read_run(recording, gains, robot, names, Topics(state_topic, command_topic))
     driver = chosen_policy(run.robot, str(policy or "")) if policy is not None or run.is_own else None
     for remark in run.remarks:
         typer.echo(f"quadvel: warning: {recording}: {remark}", err=True)

@@ -120,7 +120,8 @@ class PolicyReplay:
 
     Attributes:
         policy: The policy.
-        ticks: Rows of the commands that the policy gave, (k,), of the longest walk.
+        ticks: Rows of the commands that the policy gave, (k,), of the longest walk that was recorded
+            from its beginning.
     """
 
     def __init__(self, run: Run, policy: PolicyFile) -> None:
@@ -134,7 +135,7 @@ class PolicyReplay:
         return len(self.ticks) >= MIN_TICKS and self._run.estimate is not None and self._run.imu is not None
 
     def _policy_ticks(self) -> Indices:
-        """Return the rows of the first walk's commands that differ from the command before."""
+        """Return the rows of the longest walk's commands that differ from the command before."""
         run, commands = self._run, self._run.commands
         if run.modes is None or run.imu is None:
             return np.zeros(0, int)
@@ -142,19 +143,19 @@ class PolicyReplay:
         # The mode is reported less often than commands leave: the fade-in changes kp from tick to tick.
         fading = np.zeros(len(commands.time), bool)
         fading[1:] = (np.abs(np.diff(commands.kp, axis=0)) > 1e-6).any(axis=1) & commands.servo[1:]
-        walk = next(
-            (t for t, name in zip(run.modes.time, run.modes.name, strict=True) if name == "walk"), np.inf
-        )
-        starts = np.flatnonzero(fading & (commands.time > walk - MODE_REPORT_PERIOD_S))
-        if not starts.size:
-            return np.zeros(0, int)
-        first = int(starts[0]) - 1  # the first tick of a walk repeats the command before it
-        stop = first + 1
-        while stop < len(commands.time) and (with_gains[stop] or fading[stop]):
-            stop += 1
-        rows = np.arange(first, stop)
-        changed = (np.diff(commands.target[rows], axis=0, prepend=np.nan) != 0.0).any(axis=1)
-        return rows[changed]
+        longest = np.zeros(0, int)
+        for begin in run.modes.begins("walk"):
+            starts = np.flatnonzero(fading & (commands.time > begin - MODE_REPORT_PERIOD_S))
+            if not starts.size:
+                break
+            first = int(starts[0]) - 1  # the first tick of a walk repeats the command before it
+            stop = first + 1
+            while stop < len(commands.time) and (with_gains[stop] or fading[stop]):
+                stop += 1
+            if stop - first > len(longest):
+                longest = np.arange(first, stop)
+        changed = (np.diff(commands.target[longest], axis=0, prepend=np.nan) != 0.0).any(axis=1)
+        return longest[changed]
 
     @cached_property
     def _velocity_rows(self) -> Indices:
@@ -200,12 +201,11 @@ class PolicyReplay:
 
     @cached_property
     def _fault_time(self) -> float:
-        """Time of the first reported fault, s; infinity without one."""
-        modes = self._run.modes
+        """Time of the first fault that was reported since the walk began, s; infinity without one."""
+        modes, began = self._run.modes, self._run.commands.time[self.ticks[0]]
         assert modes is not None
-        return next(
-            (float(t) for t, fault in zip(modes.time, modes.fault, strict=True) if fault), float("inf")
-        )
+        faults = (t for t, fault in zip(modes.time, modes.fault, strict=True) if fault and t >= began)
+        return float(next(faults, np.inf))
 
     @cached_property
     def _limited(self) -> Bools:

@@ -22,6 +22,8 @@ from quadvel_nodes.messages import seconds
 from quadvel_recordings.reading import RecordingError, read_messages, recorded_description, topics
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.logs.read_log import read_log
+from quadvel_sysid.logs.readers.columns import ColumnMap
+from quadvel_sysid.logs.readers.recordings import Topics
 
 from .run import Commands, Imu, Modes, Run
 
@@ -42,13 +44,21 @@ Messages = Mapping[str, Sequence[Any]]
 """Messages by name of their topic's role."""
 
 
-def read_run(path: Path, gains: tuple[float, float] | None = None, robot: str | None = None) -> Run:
+def read_run(
+    path: Path,
+    gains: tuple[float, float] | None = None,
+    robot: str | None = None,
+    names: ColumnMap | None = None,
+    topics_of_log: Topics | None = None,
+) -> Run:
     """Read a recording.
 
     Args:
         path: A recording (MCAP, rosbag2, ROS 1), or a table that `quadvel identify` reads.
         gains: kp (N m/rad) and kd (N m s/rad) of the commands, if the file holds none.
         robot: Name or file of the robot; None for the one that the recording names.
+        names: Names of the fields in a table; None for those of `quadvel identify`.
+        topics_of_log: Topics of another stack's recording that hold states and commands; None: found by type.
 
     Returns:
         The run.
@@ -63,7 +73,7 @@ def read_run(path: Path, gains: tuple[float, float] | None = None, robot: str | 
     if STATE in types.values():
         named = described_robot(recorded_description(path))
         return _own_run(path, robot_of_file(path, named, robot), types)
-    log = read_log(path, robot=robot)
+    log = read_log(path, names=names, topics=topics_of_log, robot=robot)
     if gains is None and (log.kp is None or log.kd is None):
         raise RecordingError(f"{path}: kp, kd: the commands hold no gains, expected --gains KP KD")
     return _run_of_log(log.with_gains(gains), _others_imu(path, types, log))

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ def summary(run: Run, diagnosis: Diagnosis) -> str:
     lines = [f"{run.name}: {run.duration:.1f} s, {len(run.time)} states, {_fate(run)}"]
     found = diagnosis.finding
     if found is None:
-        lines.append(f"every link holds, and nothing else: {len(diagnosis.held)} causes examined, none found")
+        lines.append(f"every link holds: none of the {len(diagnosis.held)} causes examined was found")
     else:
         begin, end = found.measurement.span
         lines += [
@@ -45,18 +46,22 @@ def summary(run: Run, diagnosis: Diagnosis) -> str:
             f"  what to do: {found.cause.remedy}",
             f"  {len(diagnosis.held)} causes before it hold; later ones were not examined: repair, record and ask again",
         ]
-    lacking = {name: why for name, why in diagnosis.skipped.items() if not why.startswith("after ")}
-    if lacking:
-        lines.append(f"not examined: {', '.join(f'{name} ({why})' for name, why in lacking.items())}")
+    lacking: dict[str, list[str]] = defaultdict(list)
+    for name, why in diagnosis.skipped.items():
+        if not why.startswith("after "):
+            lacking[why].append(name)
+    lines += [f"not examined, because {why}: {', '.join(names)}" for why, names in lacking.items()]
     return "\n".join(lines)
 
 
 def _fate(run: Run) -> str:
     """How the run ended, as the controller reported it."""
-    if run.modes is None or not run.modes.name:
+    modes = run.modes
+    if modes is None or not modes.name:
         return "no modes recorded"
-    fault = next((fault for fault in run.modes.fault if fault), "")
-    return f"last mode {run.modes.name[-1]}" + (f", stopped by {fault}" if fault else "")
+    stopped = f", stopped by {modes.stopped_by}" if modes.stopped_by else ""
+    recovered = f", after a reset from {', '.join(modes.recovered_from)}" if modes.recovered_from else ""
+    return f"last mode {modes.name[-1]}{stopped}{recovered}"
 
 
 def to_json(run: Run, diagnosis: Diagnosis) -> dict[str, Any]:

@@ -77,6 +77,32 @@ class Modes:
     name: tuple[str, ...]
     fault: tuple[str, ...]
 
+    def begins(self, mode: str) -> list[float]:
+        """Return the times at which a mode was reported first, or again after another one, s.
+
+        Args:
+            mode: Name of the mode.
+
+        Returns:
+            The times.
+        """
+        pairs = zip(("", *self.name), self.name, strict=False)
+        return [float(t) for t, (last, now) in zip(self.time, pairs, strict=True) if now == mode != last]
+
+    @property
+    def stopped_by(self) -> str:
+        """Fault that keeps the robot stopped at the end of the run, empty without one.
+
+        A fault that damps the joints replaces the one that made the robot stand.
+        """
+        return self.fault[-1]
+
+    @property
+    def recovered_from(self) -> tuple[str, ...]:
+        """Faults that stopped the robot and were reset before the end of the run."""
+        pairs = zip(self.fault, self.fault[1:], strict=False)
+        return tuple(fault for fault, following in pairs if fault and not following)
+
 
 @attrs.frozen(eq=False)
 class Run:
