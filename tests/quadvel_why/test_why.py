@@ -172,7 +172,9 @@ def test_the_command_writes_the_finding_and_ends_with_1(run: Run, tmp_path: Path
     with pytest.raises(SystemExit) as ended:
         cli.command("why").main([str(tmp_path / "log.npz"), "--out", str(tmp_path / "out")])
     assert ended.value.code == 1
-    assert json.loads((tmp_path / "out" / "why.json").read_text())["finding"]["cause"]
+    told = json.loads((tmp_path / "out" / "why.json").read_text())
+    assert told["finding"]["cause"]
+    assert told["reports_walk"] is False
     assert (tmp_path / "out" / "why.png").stat().st_size > 1000
 
 

@@ -41,6 +41,11 @@ are named, with the experiment that distinguishes them.
 A recording of this stack holds everything that the causes need. In `LowState` and `LowCmd` of another
 robot, and in a table, kinematics and policy are missing. The causes that need them are then not
 examined, and the answer lists them.
+
+The limits are those of healthy walks. Other motions, such as those of `quadvel excite`, and drives with
+friction can exceed them: a sound chirp was called an offset of a joint. Where the recording reports no
+walk, the answer says so; `quadvel identify` is for such logs.
+
 A policy of another project (`quadvel policy import`) is not replayed; `--policy none` asks without
 one.
 

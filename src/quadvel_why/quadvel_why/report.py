@@ -17,6 +17,10 @@ from .run import Run
 
 SCHEMA = 1
 MEASURED_COLOUR, EXPECTED_COLOUR, SPAN_COLOUR = "black", "tab:orange", "tab:red"
+NO_WALK = (
+    "no walk is reported in this recording, and the limits are those of healthy walks: friction of the joints, or "
+    "another motion, may look like this; `quadvel identify` tells them apart"
+)
 
 
 def summary(run: Run, diagnosis: Diagnosis) -> str:
@@ -44,6 +48,7 @@ def summary(run: Run, diagnosis: Diagnosis) -> str:
             lines.append(f"  or {name}, which looks the same here; to tell them apart: {experiment}")
         lines += [
             f"  what to do: {found.cause.remedy}",
+            *([] if _reports_walk(run) else [f"  {NO_WALK}"]),
             f"  {len(diagnosis.held)} causes before it hold; later ones were not examined: repair, record and ask again",
         ]
     lacking: dict[str, list[str]] = defaultdict(list)
@@ -52,6 +57,11 @@ def summary(run: Run, diagnosis: Diagnosis) -> str:
             lacking[why].append(name)
     lines += [f"not examined, because {why}: {', '.join(names)}" for why, names in lacking.items()]
     return "\n".join(lines)
+
+
+def _reports_walk(run: Run) -> bool:
+    """Whether a controller reported that the robot walked."""
+    return run.modes is not None and "walk" in run.modes.name
 
 
 def _fate(run: Run) -> str:
@@ -79,6 +89,7 @@ def to_json(run: Run, diagnosis: Diagnosis) -> dict[str, Any]:
         "schema": SCHEMA,
         "recording": run.name,
         "duration_s": run.duration,
+        "reports_walk": _reports_walk(run),
         "finding": None if found is None else _finding_json(found),
         "held": {name: float(each.value) for name, each in diagnosis.held.items()},
         "skipped": diagnosis.skipped,
