@@ -54,6 +54,7 @@ from .walking_rewards import SAMPLE_S, error_magnitudes
 
 HOLD_TICKS = round(SAMPLE_S / TICK_S)  # the teacher learned with actions held for so long
 PAST_SIZE = 3 + 3 + 2 + 5  # what the teacher is told of the past
+LEVEL_SLOPE = 0.05  # m/m: steady errors on steeper ground do not shift commands
 SLOW_CELLS, LONGEST_MEMORY_S = MEMORY // 4, 4.0  # cells of a new student that forget slowly, up to this time
 AVERAGED_TICKS = 3
 """Ticks over which the teacher's actions are averaged: held actions act late by as much"""
@@ -364,6 +365,7 @@ class DaggerRun:
             fell |= env.fallen & alive
             alive &= ~(env.fallen | env.timed_out)
         steady = self.driven & alive & self.teacher.past.settled & (env.command[:, 3] < 0.5)
+        steady &= np.hypot(*env.ground_slope.T) < LEVEL_SLOPE  # a slope is no error of the student
         self.teacher.shift.add(env.command[steady], self.teacher.stride_error()[steady])
         rows["mask"][-1] = alive  # robots that end in the last tick count as ended, too
         self.samples += c.length * c.n * process_group.size()
