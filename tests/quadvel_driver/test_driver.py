@@ -313,7 +313,7 @@ def test_a_dry_run_sends_nothing_and_shows_what_it_would_send(
     process.send_signal(signal.SIGINT)
     _, text = process.communicate(timeout=40.0)
     assert process.returncode == 0
-    assert "packets would have been sent, the last: 610 bytes, ff" in text
+    assert "packets would have been sent, the last: mode servo, 610 bytes, ff" in text
     assert "hip q +0.000 dq +0.00 tau +0.00 kp 55 kd 0" in text
     board.socket.setblocking(False)
     with pytest.raises(BlockingIOError):
