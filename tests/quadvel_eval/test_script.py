@@ -35,6 +35,22 @@ def test_a_standing_robot_gets_no_request_to_stand_up() -> None:
     assert runner.update(0.1, "stance").velocity == WALK.velocity
 
 
+def test_the_walk_begins_when_the_controller_follows_velocities() -> None:
+    runner = ScriptRunner((STAND_UP, WALK))
+    runner.update(0.0, "stand_up", walk_refusal="mode is stand_up")
+    for t in (3.0, 3.1):
+        assert runner.update(t, "stance", walk_refusal="a zero velocity is missing").velocity == (
+            0.0,
+            0.0,
+            0.0,
+        )
+    assert runner.update(3.2, "stance").velocity == WALK.velocity
+    runner = ScriptRunner((STAND_UP, WALK))
+    runner.update(0.0, "stance", walk_refusal="not allowed")
+    with pytest.raises(ScriptError, match="not allowed"):
+        runner.update(20.1, "stance", walk_refusal="not allowed")
+
+
 def test_a_fault_ends_the_script_with_the_controllers_reason() -> None:
     with pytest.raises(ScriptError, match="the trunk is tilted"):
         ScriptRunner((WALK,)).update(0.0, "fault", "the trunk is tilted by 1.20 rad")

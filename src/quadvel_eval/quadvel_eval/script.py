@@ -13,7 +13,9 @@ Velocity = tuple[float, float, float]  # vx, vy (m/s), wz (rad/s)
 
 @attrs.frozen
 class ModeRequest:
-    """Request a mode of the controller and wait for a mode.
+    """Request a mode of the controller and wait for a mode, in `stance` also until velocities are followed.
+
+    A zero velocity is commanded in the awaited mode, as the controller asks for before it walks.
 
     Attributes:
         name: Name of the step.
@@ -114,13 +116,14 @@ class ScriptRunner:
         self._steps = list(steps)
         self._step_start: float | None = None  # start of the present step, s
 
-    def update(self, now: float, mode: str, reason: str = "") -> Action | None:
+    def update(self, now: float, mode: str, reason: str = "", walk_refusal: str = "") -> Action | None:
         """Return the next action.
 
         Args:
             now: Time, s.
             mode: Mode of the controller; "" before its first report.
             reason: Reason of the mode, for error messages.
+            walk_refusal: Why the controller would not follow a velocity; empty where it would.
 
         Returns:
             The action; None at the end of the script.
@@ -133,7 +136,7 @@ class ScriptRunner:
         if (
             self._steps
             and self._step_start is not None
-            and self._is_over(self._steps[0], now - self._step_start, mode)
+            and self._is_over(self._steps[0], now - self._step_start, mode, walk_refusal)
         ):
             self._steps.pop(0)
             self._step_start = None
@@ -147,14 +150,16 @@ class ScriptRunner:
                 raise ScriptError(f"the controller is in mode {mode} during '{step.name}': {reason}")
             return Action(step.name, velocity=step.velocity)
         # The mode is "" before the controller's first report.
-        is_needed = mode not in ("", step.mode, step.awaited_mode)
-        return Action(step.name, requested_mode=step.mode if is_needed else None)
+        if mode == step.awaited_mode:
+            return Action(step.name, velocity=(0.0, 0.0, 0.0))
+        return Action(step.name, requested_mode=step.mode if mode not in ("", step.mode) else None)
 
-    def _is_over(self, step: Step, elapsed: float, mode: str) -> bool:
+    def _is_over(self, step: Step, elapsed: float, mode: str, walk_refusal: str) -> bool:
         """Return whether a step has ended. Raises ScriptError after the timeout of a request."""
         if isinstance(step, Drive):
             return elapsed >= step.duration
-        if mode != step.awaited_mode and elapsed > step.timeout:
-            found = mode or "unknown"
+        is_over = mode == step.awaited_mode and not (mode == "stance" and walk_refusal)
+        if not is_over and elapsed > step.timeout:
+            found = f"{mode or 'unknown'}" + (f": {walk_refusal}" if mode == "stance" else "")
             raise ScriptError(f"'{step.name}' took more than {step.timeout:g} s; the mode is {found}")
-        return mode == step.awaited_mode
+        return is_over

@@ -41,7 +41,7 @@ class ScriptedPlanner(Node):
         super().__init__("planner")
         settings = read_parameters(self, PlannerParameters)
         self._runner = ScriptRunner(SCRIPTS[settings.script])
-        self._mode = self._reason = self._step = ""
+        self._mode = self._reason = self._walk_refusal = self._step = ""
         self._next_request = 0.0  # earliest time of the next request, s of the monotonic clock
         self._velocity = self.create_publisher(Twist, "cmd_vel", 10)
         self._announcement = self.create_publisher(String, "planner/step", 10)
@@ -53,11 +53,13 @@ class ScriptedPlanner(Node):
         """Store the mode. The first report with a rate counts: before it the controller refuses requests."""
         if self._mode or message.rate_hz:
             self._mode, self._reason = message.mode_name, message.reason
+            self._walk_refusal = message.walk_refusal
 
     def _update(self) -> None:
         """Execute the next action of the script; end the node at its end or at an error."""
         try:
-            action = self._runner.update(1e-9 * self.get_clock().now().nanoseconds, self._mode, self._reason)
+            now = 1e-9 * self.get_clock().now().nanoseconds
+            action = self._runner.update(now, self._mode, self._reason, self._walk_refusal)
         except ScriptError as error:
             request_exit(self, f"planner: {error}")
             return
