@@ -41,7 +41,8 @@ def test_a_short_demo_walks_without_a_fall_and_judges_itself(out: Path) -> None:
         *("estimator", "falls", "loop", "max_error_wz", "max_error_xy", "mean_error_wz", "mean_error_xy"),
         *("realtime_factor", "segments"),
     ]
-    assert [segment["command"] for segment in summary["segments"]] == [[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    commands = [segment["command"] for segment in summary["segments"]]
+    assert commands[-2:] == [[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]]  # the robot may stand for a while before
     assert summary["falls"] == 0
     assert summary["max_error_xy"] < 0.15
     assert max(summary["estimator"]["rmse"]) < 0.08
