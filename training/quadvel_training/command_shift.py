@@ -1,17 +1,16 @@
 """Commands for the teacher beyond those of its student, so that the student has no steady error.
 
-The teacher removes its steady errors by integrals over seconds. The student, which learns from
-sequences of a third of a second, copies them in part: at 1.5 m/s it is 0.1 m/s slow. So the teacher
-is asked for a shifted command. The shift grows by the student's own mean error at each command, as
+The teacher removes its steady errors by integrals over seconds. The student, whose sequences last for
+a second, learns them in part: without this shift it was 0.1 m/s slow at 1.5 m/s. So the teacher is
+asked for a shifted command. The shift grows by the student's own mean error at each command, as
 in integral control, until there is none. It is a smooth function of the command:
 
     shift(c) = W phi(c),   W <- W + gain argmin_V sum_i w_i |e_i - V phi(c_i)|^2 + ridge |V|^2
 
 where e_i is the command minus the velocity of a robot that the student drives, and phi are the
 monomials of vx, vy and yaw rate up to the third degree. Errors are bounded, so that few robots that
-slip or carry much do not shift all others. All processes of a run share the shift.
-Weights w_i fall with the command: at the fastest ones
-robots fall before they are steady. The mirrored command gets the mirrored shift.
+slip or carry much do not shift all others. All processes of a run share the shift. Weights w_i fall
+with the command: at the fastest ones robots fall before they are steady. The mirrored command gets the mirrored shift.
 """
 
 from __future__ import annotations

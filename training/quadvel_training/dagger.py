@@ -8,9 +8,9 @@ student falls far more often than by itself, and its advice is worth little. Eac
 place in the order in which the student takes over. If drivers were drawn for each episode, few
 robots would stay with a student that falls soon.
 
-The student has to remember what the teacher is told of the past: errors over a stride and over
+The student has to remember what the teacher observes of the past: errors over a stride and over
 seconds, and the phase of its steps. So its sequences last for seconds, and a linear map from its
-memory, which is not part of the policy, learns to say these numbers. What is left of its steady
+memory, which is not part of the policy, learns to predict these numbers. What is left of its steady
 errors the teacher removes by shifted commands (`command_shift`).
 """
 
@@ -53,7 +53,7 @@ from .randomisation import Randomisation, load_actuator
 from .walking_rewards import SAMPLE_S, error_magnitudes
 
 HOLD_TICKS = round(SAMPLE_S / TICK_S)  # the teacher learned with actions held for so long
-PAST_SIZE = 3 + 3 + 2 + 5  # what the teacher is told of the past
+PAST_SIZE = 3 + 3 + 2 + 5  # what the teacher observes of the past
 LEVEL_SLOPE = 0.05  # m/m: steady errors on steeper ground do not shift commands
 SLOW_CELLS, LONGEST_MEMORY_S = MEMORY // 4, 4.0  # cells of a new student that forget slowly, up to this time
 AVERAGED_TICKS = 3
@@ -78,7 +78,7 @@ class DaggerConfig:
         driven: share of robots that the student drives at the end.
         first_driven: the same at the start.
         takeover: samples from `first_driven` to `driven`.
-        recall: weight of the error of what a linear map of the memory says of the past.
+        recall: weight of the squared error of a linear map from the memory to the past features.
         noise: standard deviation of the noise of every action, in the network's unit.
         noise_time: s, time constant of the noise.
         timestep: s, of the physics.
@@ -119,7 +119,7 @@ class Experience:
     Attributes:
         obs: (T, N, 48), observations.
         label: (T, N, 12), actions of the teacher.
-        past: (T, N, PAST_SIZE), what the teacher is told of the past.
+        past: (T, N, PAST_SIZE), what the teacher observes of the past.
         mask: (T, N), 1 for robots that are up.
     """
 
@@ -197,8 +197,8 @@ class Teacher:
         self.past.advance(command + self.shift.of(command))
         self._executed.append(executed.clip(-ACTION_BOUND, ACTION_BOUND))
 
-    def seen_of_the_past(self) -> np.ndarray:
-        """What the teacher is told that a memory has to keep.
+    def past_features(self) -> np.ndarray:
+        """Return what the teacher observes of the past, which a memory has to keep.
 
         Returns:
             (n, PAST_SIZE), scaled to about 1: errors over a stride and lasting ones, lag, plan.
@@ -356,7 +356,7 @@ class DaggerRun:
             drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
             self._noise = decay * self._noise + drawn_std * drawn
             self._previous = np.where(self.driven[:, None], own, label) + self._noise
-            seen = obs, label, self.teacher.seen_of_the_past(), alive.copy()
+            seen = obs, label, self.teacher.past_features(), alive.copy()
             for values, value in zip(rows.values(), seen, strict=True):
                 values.append(value)
             command = env.command.copy()

@@ -43,8 +43,8 @@ robot, and in a table, kinematics and policy are missing. The causes that need t
 examined, and the answer lists them.
 
 The limits are those of healthy walks. Other motions, such as those of `quadvel excite`, and drives with
-friction can exceed them: a sound chirp was called an offset of a joint. Where the recording reports no
-walk, the answer says so; `quadvel identify` is for such logs.
+friction can exceed them: in a chirp, the friction of a calf was called an offset of the joint. If the
+recording reports no walk, the answer has a note; `quadvel identify` is for such logs.
 
 A policy of another project (`quadvel policy import`) is not replayed; `--policy none` asks without
 one.

@@ -109,6 +109,11 @@ class Model:
         residual: Array = self.samples.tau - self.predict()
         return residual
 
+    @property
+    def _charged_gains(self) -> Array:
+        """Gains (2, J) whose encoder noise the model is charged for."""
+        return self.gains if self.law_gains is None else self.law_gains
+
     def averaged_noise(self) -> Array:
         """Return the variance of encoder noise that interpolation between rows removes from the residual.
 
@@ -120,7 +125,7 @@ class Model:
         """
         # tau holds g_p kp e_q + g_d kd e_dq, with the noise e of q and dq at the instant u.
         s, (q_noise, dq_noise) = self.signals, self.samples.sources.encoder_noise
-        kp, kd = self.gains if self.law_gains is None else self.law_gains
+        kp, kd = self._charged_gains
         noise: Array = (kp * s.kp) ** 2 * q_noise + (kd * s.kd) ** 2 * dq_noise
         return noise * s.averaging
 
@@ -142,8 +147,8 @@ class Model:
         #     d = tau(q + e_q, dq + e_dq) - tau(q, dq);   result = mean(d_plain^2 - d^2), at least 0
         if not self.effects:
             return np.zeros(rows.shape[1])
-        law = self.gains if self.law_gains is None else self.law_gains
-        plain, noisy = attrs.evolve(self, effects=(), gains=law), self.samples.noisier
+        plain = attrs.evolve(self, effects=(), gains=self._charged_gains)
+        noisy = self.samples.noisier
         with_effects, without = (
             attrs.evolve(one, samples=noisy).predict() - one.predict() for one in (self, plain)
         )
