@@ -106,17 +106,32 @@ class CommandGrid:
         self.shape = tuple((cells[0] + cells[1] + 1).tolist())
         index = np.stack(np.meshgrid(*(np.arange(n) for n in self.shape), indexing="ij"), axis=-1)
         self._middle = (index + self._first) * CELL_WIDTH
-        nearest = np.sign(self._middle) * np.maximum(np.abs(self._middle) - 0.5 * np.array(CELL_WIDTH), 0.0)
-        self.allowed = np.array([self._inside(c) for c in nearest.reshape(-1, 3)]).reshape(self.shape)
+        self.allowed = self._cells_within_limits()
         self._near = (np.abs(self._middle) <= np.array(INITIAL_REACH) + 1e-9).all(axis=-1) & self.allowed
         self.success = np.zeros(self.shape)
         self.followed = np.zeros(self.shape, bool)
+        self._open_around_followed()
+
+    def narrow(self, limits: VelocityCommandLimits) -> None:
+        """Draw only commands within narrower limits from now on.
+
+        Args:
+            limits: limits within those of the grid.
+        """
+        self._limits = limits
+        self.allowed &= self._cells_within_limits()
+        self._near &= self.allowed
         self._open_around_followed()
 
     @property
     def hold(self) -> tuple[float, float]:
         """Time until the next command, from and to, s."""
         return self.config.hold
+
+    def _cells_within_limits(self) -> np.ndarray:
+        """Cells that reach into the limits, bool, of the grid's shape."""
+        nearest = np.sign(self._middle) * np.maximum(np.abs(self._middle) - 0.5 * np.array(CELL_WIDTH), 0.0)
+        return np.array([self._inside(c) for c in nearest.reshape(-1, 3)]).reshape(self.shape)
 
     def _inside(self, command: np.ndarray) -> bool:
         """Whether a command (3,) lies within the limits."""

@@ -27,6 +27,7 @@ from quadvel_sim.physics import Physics
 from quadvel_sim.terrain import Terrain
 
 from .randomisation import PlantSampler, Randomisation, sample_actuators
+from .similarity import Size
 
 TICK_S = 0.005  # one sample of the policy on the robot
 HEAT_LOSS_W_PER_N2M2 = 0.2  # k_r of the paper's energy term
@@ -34,6 +35,7 @@ RAMP_RANGE = (0.7, 5.0)  # m/s^2, from and to: slope of commands that ramp
 RAMP_DOWN = 4.0  # factor of the slope of commands that decrease
 RAMP_AXES = np.array([1.0, 0.7, 1.25])  # factors of vx, vy and, in rad/m, wz
 EDGE_MARGIN_M = 0.6  # before the end of rough ground, where episodes time out
+FALLEN_HEIGHT_M = 0.18  # trunks of robots of the reference size that are lower have fallen (`similarity`)
 MAX_PLAUSIBLE_SPEED = 150.0  # m/s or rad/s of any body or joint; beyond it the physics diverges
 
 
@@ -217,6 +219,7 @@ class VelocityEnv:
     Attributes:
         config: configuration.
         robot: the robot.
+        size: its size, for gait and rewards.
         commands: source of commands.
         command: (n, 4), command in force; it may still ramp to the one that was drawn.
         q: (n, 12), rad.
@@ -250,6 +253,7 @@ class VelocityEnv:
         """
         self.config = c = config
         self.robot = robot = c.robot
+        self.size = Size.of(robot)
         self.commands: Commands = commands or c.commands
         self.model = training_model(c.robot, c.timestep, c.terrain, c.randomisation.torsional_friction[1])
         self.substeps = round(c.period / c.timestep)
@@ -465,9 +469,14 @@ class VelocityEnv:
         self.clearance = self.feet[..., 2] - self._ground(self.feet) - self.robot.foot_radius
         self.contact = self.clearance < 0.001
         self.height = qpos[:, 2] - self._ground(qpos)
-        self.fallen = (self.height < 0.18) | (np.abs(self.roll_pitch).max(axis=1) > 0.9)
+        self.fallen = (self.height < FALLEN_HEIGHT_M * self.size.length) | (np.abs(self.roll_pitch).max(axis=1) > 0.9)
         left_the_field = np.abs(qpos[:, :2]).max(axis=1) > self._edge
         self.timed_out = (self.time >= self.config.episode) | left_the_field
+
+    @property
+    def planar_velocity(self) -> np.ndarray:
+        """Velocity of the trunk forward and left (m/s) and its yaw rate (rad/s), (n, 3), body frame."""
+        return np.concatenate([self.velocity[:, :2], self.angular_velocity[:, 2:]], axis=1)
 
     def sense(self) -> dict[str, np.ndarray]:
         """Return noisy measurements.

@@ -6,6 +6,8 @@ Touchdowns correct the phase, so that the clock follows the robot, and a student
 which imitates the teacher, does not drift away from it. A robot that is commanded to stand
 steps until it is at rest on four feet; one that is pushed while it stands steps again.
 
+The numbers hold for a robot of the reference size; those of others follow by `similarity`.
+
 Source of rewards with a clock: Siekmann et al., Sim-to-Real Learning of All Common Bipedal Gaits
 via Periodic Reward Composition (2021); Margolis and Agrawal, Walk These Ways (2022).
 """
@@ -13,6 +15,8 @@ via Periodic Reward Composition (2021); Margolis and Agrawal, Walk These Ways (2
 from __future__ import annotations
 
 import numpy as np
+
+from .similarity import Size
 
 FOOT_PHASES = np.array([0.0, 0.5, 0.5, 0.0])  # cycles, in the order of quadruped.LEGS: FR with RL, FL with RR
 FREQUENCY = (1.9, 0.655, 4.4)  # Hz at rest, increase in Hz per m/s, highest Hz
@@ -27,10 +31,10 @@ PUSHED_SPEED = 0.4  # m/s; a standing robot whose trunk is faster steps
 
 
 def foot_pace(velocity: np.ndarray) -> np.ndarray:
-    """Speed at which a velocity moves the feet.
+    """Speed at which a velocity moves the feet of a robot of the reference size.
 
     Args:
-        velocity: (n, 3 or more), vx, vy (m/s), yaw rate (rad/s).
+        velocity: (n, 3), vx, vy (m/s), yaw rate (rad/s).
 
     Returns:
         (n,), m/s.
@@ -39,7 +43,7 @@ def foot_pace(velocity: np.ndarray) -> np.ndarray:
 
 
 def step_frequency(velocity: np.ndarray) -> np.ndarray:
-    """Planned steps of a foot per second.
+    """Planned steps of a foot per second, of a robot of the reference size.
 
     Args:
         velocity: (n, 3), planned vx, vy (m/s) and yaw rate (rad/s).
@@ -52,7 +56,7 @@ def step_frequency(velocity: np.ndarray) -> np.ndarray:
 
 
 def duty_factor(velocity: np.ndarray) -> np.ndarray:
-    """Planned share of a cycle that a foot is on the ground.
+    """Planned share of a cycle that a foot is on the ground, of a robot of the reference size.
 
     Args:
         velocity: (n, 3), planned vx, vy (m/s) and yaw rate (rad/s).
@@ -68,18 +72,21 @@ class GaitClock:
     """Plan of the trot of `n` robots.
 
     Attributes:
+        size: size of the robots.
         phase: (n,), cycles since the planned touchdown of the feet FR and RL, 0 to 1.
         velocity: (n, 3), planned: vx, vy (m/s), yaw rate (rad/s).
         walking: (n,) bool, whether the plan has steps.
         first: (n,), phase at which a walk starts: `START_PHASE`, or half a cycle later.
     """
 
-    def __init__(self, n: int) -> None:
+    def __init__(self, n: int, size: Size = Size()) -> None:
         """Create the plans of standing robots.
 
         Args:
             n: number of robots.
+            size: their size.
         """
+        self.size = size
         self.phase, self.velocity = np.full(n, START_PHASE), np.zeros((n, 3))
         self.walking, self.first = np.zeros(n, bool), np.full(n, START_PHASE)
 
@@ -99,19 +106,36 @@ class GaitClock:
         Args:
             command: (n, 4), command that was in force.
             speed: (n,), m/s, horizontal speed of the trunk.
-            stepped: (n, 4) bool, feet that touched the ground after `SHORTEST_SWING_S` or more.
+            stepped: (n, 4) bool, feet that touched the ground after `shortest_swing` or more.
             period: s.
         """
-        reach = ACCELERATION * period
+        # ACCELERATION is that of the reference: (m/s^2) * 1, (rad/s^2) / length
+        reach = ACCELERATION / [1.0, 1.0, self.size.length] * period
         self.velocity = self.velocity + np.clip(command[:, :3] - self.velocity, -reach, reach)
         # phase <- phase + f dt - CORRECTION sum_i e_i,  e_i = phase of foot i at its touchdown,
         # within -0.5 and 0.5
-        phase = self.phase + step_frequency(self.velocity) * period
+        phase = self.phase + self.frequency * period
         error = (phase[:, None] + FOOT_PHASES + 0.5) % 1.0 - 0.5
         phase = (phase - CORRECTION * (error * stepped).sum(axis=1)) % 1.0
         self.phase = np.where(self.walking, phase, self.first)
-        at_rest = (speed < REST_SPEED) & ~self.velocity.any(axis=1) & (self.swing_share() < 0.0).all(axis=1)
-        self.walking = np.where(self.walking, ~at_rest, speed > PUSHED_SPEED) | (command[:, 3] < 0.5)
+        slow, pushed = REST_SPEED * self.size.time, PUSHED_SPEED * self.size.time
+        at_rest = (speed < slow) & ~self.velocity.any(axis=1) & (self.swing_share() < 0.0).all(axis=1)
+        self.walking = np.where(self.walking, ~at_rest, speed > pushed) | (command[:, 3] < 0.5)
+
+    @property
+    def shortest_swing(self) -> float:
+        """Time after which a foot that touches the ground has stepped, s."""
+        return SHORTEST_SWING_S * self.size.time
+
+    @property
+    def frequency(self) -> np.ndarray:
+        """Planned steps of a foot per second, (n,), Hz."""
+        return step_frequency(self.size.as_reference(self.velocity)) / self.size.time
+
+    @property
+    def duty(self) -> np.ndarray:
+        """Planned share of a cycle that a foot is on the ground, (n,)."""
+        return duty_factor(self.size.as_reference(self.velocity))
 
     def foot_phases(self, ahead: np.ndarray | float = 0.0) -> np.ndarray:
         """Return the phase of each foot.
@@ -133,7 +157,7 @@ class GaitClock:
         Returns:
             (n, 4), 0 at lift-off to 1 at touchdown; negative while the foot is planned to be down.
         """
-        duty = duty_factor(self.velocity)[:, None]
+        duty = self.duty[:, None]
         return np.asarray((self.foot_phases(ahead) - duty) / (1.0 - duty))
 
     def observation(self) -> np.ndarray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from .env import VelocityEnv
-from .gait_clock import SHORTEST_SWING_S, GaitClock
+from .gait_clock import GaitClock
 
 STRIDE_S = 0.35  # time constant of stride errors: about a stride
 LASTING_S = 1.5  # time constant of lasting errors
@@ -44,7 +44,7 @@ class Past:
         self.env, self._hips_ahead = env, env.robot.legs.hips[:, 0]  # m, body frame
         self.stride, self.lasting, self.lag = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 2))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
-        self.off_hip, self.clock = np.zeros((n, 4)), GaitClock(n)
+        self.off_hip, self.clock = np.zeros((n, 4)), GaitClock(n, env.size)
         self._age = np.zeros(n)  # s, since the plan has the commanded velocity
         self._landed, self._last = np.zeros((n, 4)), np.zeros((n, 4))  # m ahead of the hip: at touchdown, now
 
@@ -77,7 +77,7 @@ class Past:
             array[env.changed] = 0.0
         self._advance_stances()
         speed = np.hypot(env.velocity[:, 0], env.velocity[:, 1])
-        self.clock.advance(command, speed, env.contact & (self.air >= SHORTEST_SWING_S), period)
+        self.clock.advance(command, speed, env.contact & (self.air >= self.clock.shortest_swing), period)
         self.air = np.where(env.contact, 0.0, self.air + period)
         self.down = np.where(env.contact, self.down + period, 0.0)
 
@@ -110,5 +110,4 @@ def velocity_error(env: VelocityEnv, command: np.ndarray) -> np.ndarray:
     Returns:
         (n, 3): vx, vy in m/s, yaw rate in rad/s.
     """
-    velocity = np.concatenate([env.velocity[:, :2], env.angular_velocity[:, 2:]], axis=1)
-    return np.asarray(command[:, :3] - velocity)
+    return np.asarray(command[:, :3] - env.planar_velocity)

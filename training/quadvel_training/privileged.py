@@ -41,7 +41,7 @@ from .walking_rewards import (
 
 ACTION_SCALE = 0.4  # rad per unit of the network's output
 ACTION_BOUND = 4.0  # in the network's unit
-WALKING_HEIGHT_M = 0.38  # typical height of the trunk
+WALKING_HEIGHT_M = 0.38  # typical height of the trunk of a robot of the reference size
 
 
 def _signs(*signs: float) -> Mirror:
@@ -98,7 +98,7 @@ def observe_state(
             previous,
             env.contact,
             np.clip(5 * env.clearance, -1, 2),
-            5 * (env.height[:, None] - WALKING_HEIGHT_M),
+            5 * (env.height[:, None] - WALKING_HEIGHT_M * env.size.length),
             2 * past.stride,
             2 * past.lasting,
             3 * env.ground_slope,

@@ -4,7 +4,8 @@ Feet follow the gait clock: swings rise and return, stances sweep at the planned
 of the true state keep robots on their feet: feet are placed by the excess velocity and by the way
 that the robot lags behind, the trunk is levelled and kept at its height, feet turn against a wrong
 yaw rate. In curves the feet are placed further out. The gains were found by a search over walks of
-robots drawn as in training, with a trained correction.
+robots drawn as in training, with a trained correction. Lengths, times and speeds hold for a robot
+of the reference size; those of others follow by `similarity`.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from quadvel_description.kinematics import foot_positions, inverse_kinematics
 from quadvel_description.quadruped import GRAVITY
 
 from .env import VelocityEnv
-from .gait_clock import GaitClock, duty_factor, step_frequency
+from .gait_clock import GaitClock
 
 HEIGHT_M = 0.37  # of the trunk above ground
 CROUCH_M = 0.032  # by which the trunk is lower than in the nominal posture: longer steps are in reach
 LIFT_M = 0.104  # height of a swing
 LONGEST_STEP_M = 0.198  # way of a foot under the trunk in one stance
-LEAD_S = 0.077  # joints follow their targets so late
+LEAD_S = 0.077  # joints follow their targets so late, whatever the size
 PLACEMENT_S = np.array([0.085, 0.064])  # x, y: feet are placed this time times the excess velocity out,
 BEHIND_S = np.array([0.062, 0.034])  # this time times the planned velocity behind, which drives,
 DRAG = np.array([0.0055, 0.0])  # s^2/m, this times its square behind, as steps lose speed,
@@ -50,15 +51,17 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.nda
     Returns:
         (n, 12), rad.
     """
-    robot, planned, n = env.robot, clock.velocity, len(clock.velocity)
-    below = foot_positions(robot, robot.nominal_q) + np.array([0.0, 0.0, CROUCH_M])  # (4, 3), m, trunk frame
-    duty, frequency = duty_factor(planned), step_frequency(planned)
-    ahead = LEAD_S * frequency
+    # All velocities and lengths here are those of a reference robot that moves alike.
+    robot, size = env.robot, env.size
+    planned, velocity = size.as_reference(clock.velocity), size.as_reference(env.planar_velocity)
+    below = foot_positions(robot, robot.nominal_q) / size.length + [0.0, 0.0, CROUCH_M]  # (4, 3), trunk frame
+    duty, frequency = clock.duty, clock.frequency * size.time
+    ahead = LEAD_S * clock.frequency
     phases = clock.foot_phases(ahead)
     share = np.where(clock.walking[:, None], clock.swing_share(ahead), -1.0)
     swing, down = np.maximum(share, 0.0), share < 0.0  # s: share of the planned swing that is over
-    excess = np.clip(env.velocity[:, :2] - planned[:, :2], -MAX_EXCESS, MAX_EXCESS)
-    turning = np.clip(env.angular_velocity[:, 2] - planned[:, 2], -MAX_YAW_EXCESS, MAX_YAW_EXCESS)
+    excess = np.clip(velocity[:, :2] - planned[:, :2], -MAX_EXCESS, MAX_EXCESS)
+    turning = np.clip(velocity[:, 2] - planned[:, 2], -MAX_YAW_EXCESS, MAX_YAW_EXCESS)
     # way of a foot at (x, y) in a stance of duty / f: (vx - w y, vy + w x) duty / f,
     # w = w_planned - YAW_GAIN (w_z - w_planned)
     sweep = planned - [0.0, 0.0, YAW_GAIN] * turning[:, None]
@@ -75,21 +78,21 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.nda
     # A trunk at height h above feet that are a distance d aside accelerates by g d / h.
     placed = PLACEMENT_S * excess - BEHIND_S * np.clip(planned[:, :2], -MAX_BEHIND, MAX_BEHIND)
     placed -= DRAG * np.abs(planned[:, :2]) * planned[:, :2]
-    placed -= CATCH_UP * lag * clock.walking[:, None]
+    placed -= CATCH_UP * lag / size.length * clock.walking[:, None]
     placed -= CURVE * HEIGHT_M / GRAVITY * _turned(planned[:, None, :2], planned[:, 2])[:, 0]
-    feet = np.broadcast_to(below, (n, 4, 3)).copy()
+    feet = np.broadcast_to(below, (len(planned), 4, 3)).copy()
     feet[..., :2] += 0.5 * way * along[..., None] + placed[:, None, :] + _turned(below, TURN_S * turning)
     # z_foot = z_nominal + LIFT_M sin^2(pi s); a stance foot on the lower side of the trunk pushes
     # down: z_foot += y roll - x pitch, both extrapolated by RATE_S, times LEVELLING; while walking,
     # z_foot += HEIGHT_GAIN (h - HEIGHT_M)
-    roll, pitch = (LEVELLING * (env.roll_pitch + RATE_S * env.angular_velocity[:, :2])).T[..., None]
+    roll, pitch = (LEVELLING * (env.roll_pitch + RATE_S * size.time * env.angular_velocity[:, :2])).T[..., None]
     level = below[:, 1] * roll - below[:, 0] * pitch
-    above = np.clip(env.height - HEIGHT_M, -MAX_HEIGHT_ERROR_M, MAX_HEIGHT_ERROR_M) * clock.walking
+    above = np.clip(env.height / size.length - HEIGHT_M, -MAX_HEIGHT_ERROR_M, MAX_HEIGHT_ERROR_M) * clock.walking
     feet[..., 2] += LIFT_M * np.sin(np.pi * swing) ** 2 + (level + HEIGHT_GAIN * above[:, None]) * down
     # a planned stance carries 4 / (number of planned stances) of its load on four feet
     carried = down * 4.0 / np.maximum(down.sum(axis=1, keepdims=True), 1) - 1.0
     load = LOAD * np.repeat(carried, 3, axis=1) * (env.stand_q - robot.nominal_q)
-    return np.asarray(inverse_kinematics(robot, feet) - robot.nominal_q + load)
+    return np.asarray(inverse_kinematics(robot, size.length * feet) - robot.nominal_q + load)
 
 
 def _turned(feet: np.ndarray, angle: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from .past import Past
 
 SAMPLE_S = 0.02  # how long the teacher holds an action
 MIN_REWARD, MAX_REWARD = -6.0, 4.0  # bounds of a sample's sum of terms, without falls
-TARGET_HEIGHT_M = 0.36  # of the trunk
+TARGET_HEIGHT_M = 0.36  # of the trunk; of a robot of the reference size, as the next one (`similarity`)
 SWING_CLEARANCE_M = 0.06  # wanted clearance in swing
 OVERSPEED_SHARE = 0.8  # of a joint's speed limit; `overspeed` penalises more
 
@@ -220,7 +220,7 @@ class WalkingRewards:
             "bounce": -w.bounce * env.velocity[:, 2] ** 2
             - w.rocking * np.sum(env.angular_velocity[:, :2] ** 2, axis=1),
             "tilt": -w.tilt * np.sum((env.roll_pitch - lean) ** 2, axis=1),
-            "height": -w.height * np.minimum((env.height - TARGET_HEIGHT_M) ** 2, 0.02),
+            "height": -w.height * np.minimum((env.height - TARGET_HEIGHT_M * env.size.length) ** 2, 0.02),
             "power": -w.power * self._slowness(command) * env.power / (1 + 0.5 * speed),
             "acceleration": -w.acceleration * np.sum(acceleration**2, axis=1),
             "smoothness": -w.rate * np.sum((now - before) ** 2, axis=1)
@@ -233,10 +233,10 @@ class WalkingRewards:
         """Rewards of swing and stance of the feet."""
         env, w = self.env, self.weights
         speed = np.hypot(env.foot_velocity[..., 0], env.foot_velocity[..., 1])
-        # swing share s: below 0 in the planned stance; wanted clearance: SWING_CLEARANCE_M sin(pi s)
-        share = past.clock.swing_share()
-        wanted = SWING_CLEARANCE_M * np.sin(np.pi * np.maximum(share, 0.0))
-        lifted = np.clip(np.minimum(env.clearance, wanted), 0.0, None) / SWING_CLEARANCE_M
+        # swing share s: below 0 in the planned stance; wanted clearance: top sin(pi s)
+        share, top = past.clock.swing_share(), SWING_CLEARANCE_M * env.size.length
+        wanted = top * np.sin(np.pi * np.maximum(share, 0.0))
+        lifted = np.clip(np.minimum(env.clearance, wanted), 0.0, None) / top
         return {
             "schedule": w.schedule * (env.contact == (share < 0.0)).mean(axis=1),
             "lift": w.lift * lifted.mean(axis=1),
@@ -245,7 +245,7 @@ class WalkingRewards:
 
     def _slowness(self, command: np.ndarray) -> np.ndarray:
         """Factor (n,) of the penalty of power: `slow` at rest, 1 from 1 m/s on."""
-        decay = np.maximum(1.0 - foot_pace(command) ** 2, 0.0)
+        decay = np.maximum(1.0 - foot_pace(self.env.size.as_reference(command[:, :3])) ** 2, 0.0)
         # 1 + (slow - 1) max(1 - pace^2, 0)
         return np.asarray(1.0 + (self.weights.slow - 1.0) * decay)
 
