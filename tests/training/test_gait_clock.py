@@ -14,7 +14,8 @@ from quadvel_training.gait_clock import START_PHASE, GaitClock, duty_factor, ste
 from quadvel_training.past import Past  # noqa: E402
 from quadvel_training.privileged import ACTION_SCALE, total_action  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
-from tests.helpers.robots import ALIENGO  # noqa: E402
+from quadvel_training.similarity import Size  # noqa: E402
+from tests.helpers.robots import ALIENGO, GO2  # noqa: E402
 
 PERIOD = 0.02  # s
 WALK, STAND = np.array([[1.0, 0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]])
@@ -134,12 +135,13 @@ COMMANDS = [
 ]
 
 
-def test_the_scripted_trot_alone_stands_and_follows_slow_commands_in_all_directions():
+@pytest.mark.parametrize("robot", [ALIENGO, GO2], ids=lambda robot: robot.name)
+def test_the_scripted_trot_alone_stands_and_follows_slow_commands_in_all_directions(robot):
     n = len(COMMANDS)
     command = np.concatenate([COMMANDS, np.zeros((n, 1))], axis=1)
     command[0, 3] = 1.0  # stands
     config = EnvConfig(
-        robot=ALIENGO, n=n, threads=1, period=PERIOD, timestep=0.004, randomisation=Randomisation.none()
+        robot=robot, n=n, threads=1, period=PERIOD, timestep=0.004, randomisation=Randomisation.none()
     )
     env = VelocityEnv(attrs.evolve(config, ramped=0.0), FixedCommands(command))
     past, velocity = Past(env), []
@@ -153,12 +155,14 @@ def test_the_scripted_trot_alone_stands_and_follows_slow_commands_in_all_directi
     assert np.abs(error[:, 2]).max() < 0.4
 
 
-def test_the_scripted_trot_alone_runs():
-    speeds = np.array([1.5, 2.0, 2.5])  # m/s
+@pytest.mark.parametrize("robot", [ALIENGO, GO2], ids=lambda robot: robot.name)
+def test_the_scripted_trot_alone_runs(robot):
+    size = Size.of(robot)
+    speeds = size.time * np.array([1.5, 2.0, 2.5])  # m/s
     command = np.zeros((3, 4))
     command[:, 0] = speeds
     config = EnvConfig(
-        robot=ALIENGO, n=3, threads=1, period=PERIOD, timestep=0.004, randomisation=Randomisation.none()
+        robot=robot, n=3, threads=1, period=PERIOD, timestep=0.004, randomisation=Randomisation.none()
     )
     env = VelocityEnv(attrs.evolve(config, ramped=0.0), FixedCommands(command))
     past, velocity, height = Past(env), [], []
@@ -169,7 +173,7 @@ def test_the_scripted_trot_alone_runs():
         height.append(env.height.copy())
         assert not env.fallen.any()
     assert (np.mean(velocity[100:], axis=0) > 0.75 * speeds).all()
-    assert np.abs(np.mean(height[100:], axis=0) - 0.37).max() < 0.04
+    assert np.abs(np.mean(height[100:], axis=0) / size.length - 0.37).max() < 0.04
 
 
 def test_a_walk_that_starts_with_the_other_pair_is_half_a_cycle_apart() -> None:

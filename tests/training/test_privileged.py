@@ -10,6 +10,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_description import symmetry  # noqa: E402
 from quadvel_description.kinematics import foot_positions  # noqa: E402
+from quadvel_policy.observation import VelocityCommandLimits  # noqa: E402
 from quadvel_sim.terrain import Terrain  # noqa: E402
 from quadvel_training import loop, privileged, process_group, scripted_trot  # noqa: E402
 from quadvel_training.command_grid import CELL_WIDTH, INITIAL_REACH, CommandGrid, GridConfig  # noqa: E402
@@ -109,6 +110,18 @@ def test_cells_close_again_where_commands_are_followed_no_more(grid):
     assert not grid.open[grid.cell_of(np.array((2.5, 0.0, 0.0)))]
     assert grid.open[grid.cell_of(np.array((2.0, 0.0, 0.0)))]
     assert grid.summary()["forward"] == 1.5
+
+
+def test_a_narrowed_grid_draws_commands_within_the_narrower_limits_alone(grid):
+    narrow = VelocityCommandLimits((-1.2, -0.5, -1.0), (1.4, 0.5, 1.0), curve=1.5)
+    grid.success[:] = 1.0
+    grid.record(np.zeros((0, 4)), np.zeros((0, 2)), np.zeros(0, bool))
+    assert grid.draw(np.random.default_rng(1), 2000)[:, 0].max() > 3.0
+    grid.narrow(narrow)
+    drawn = grid.draw(np.random.default_rng(1), 2000)[:, :3]
+    assert [narrow.clamp(one) for one in drawn.tolist()] == [pytest.approx(one) for one in drawn.tolist()]
+    assert np.ptp(drawn, axis=0) == pytest.approx([2.6, 1.0, 2.0], rel=0.05)
+    assert not grid.contains(np.array([[2.0, 0.0, 0.0]]))[0]
 
 
 def test_what_is_followed_to_the_left_is_open_to_the_right(grid):

@@ -469,7 +469,9 @@ class VelocityEnv:
         self.clearance = self.feet[..., 2] - self._ground(self.feet) - self.robot.foot_radius
         self.contact = self.clearance < 0.001
         self.height = qpos[:, 2] - self._ground(qpos)
-        self.fallen = (self.height < FALLEN_HEIGHT_M * self.size.length) | (np.abs(self.roll_pitch).max(axis=1) > 0.9)
+        self.fallen = (self.height < FALLEN_HEIGHT_M * self.size.length) | (
+            np.abs(self.roll_pitch).max(axis=1) > 0.9
+        )
         left_the_field = np.abs(qpos[:, :2]).max(axis=1) > self._edge
         self.timed_out = (self.time >= self.config.episode) | left_the_field
 

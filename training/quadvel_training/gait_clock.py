@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .similarity import Size
+from .similarity import REFERENCE, Size
 
 FOOT_PHASES = np.array([0.0, 0.5, 0.5, 0.0])  # cycles, in the order of quadruped.LEGS: FR with RL, FL with RR
 FREQUENCY = (1.9, 0.655, 4.4)  # Hz at rest, increase in Hz per m/s, highest Hz
@@ -79,7 +79,7 @@ class GaitClock:
         first: (n,), phase at which a walk starts: `START_PHASE`, or half a cycle later.
     """
 
-    def __init__(self, n: int, size: Size = Size()) -> None:
+    def __init__(self, n: int, size: Size = REFERENCE) -> None:
         """Create the plans of standing robots.
 
         Args:

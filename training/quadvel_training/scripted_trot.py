@@ -85,9 +85,13 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.nda
     # z_foot = z_nominal + LIFT_M sin^2(pi s); a stance foot on the lower side of the trunk pushes
     # down: z_foot += y roll - x pitch, both extrapolated by RATE_S, times LEVELLING; while walking,
     # z_foot += HEIGHT_GAIN (h - HEIGHT_M)
-    roll, pitch = (LEVELLING * (env.roll_pitch + RATE_S * size.time * env.angular_velocity[:, :2])).T[..., None]
+    roll, pitch = (LEVELLING * (env.roll_pitch + RATE_S * size.time * env.angular_velocity[:, :2])).T[
+        ..., None
+    ]
     level = below[:, 1] * roll - below[:, 0] * pitch
-    above = np.clip(env.height / size.length - HEIGHT_M, -MAX_HEIGHT_ERROR_M, MAX_HEIGHT_ERROR_M) * clock.walking
+    above = (
+        np.clip(env.height / size.length - HEIGHT_M, -MAX_HEIGHT_ERROR_M, MAX_HEIGHT_ERROR_M) * clock.walking
+    )
     feet[..., 2] += LIFT_M * np.sin(np.pi * swing) ** 2 + (level + HEIGHT_GAIN * above[:, None]) * down
     # a planned stance carries 4 / (number of planned stances) of its load on four feet
     carried = down * 4.0 / np.maximum(down.sum(axis=1, keepdims=True), 1) - 1.0

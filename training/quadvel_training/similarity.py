@@ -58,3 +58,6 @@ class Size:
         """
         # v_reference = v / sqrt(length), w_reference = w sqrt(length)
         return velocity * np.array([1.0 / self.time, 1.0 / self.time, self.time])
+
+
+REFERENCE = Size()

@@ -1,0 +1,45 @@
+"""Dynamic similarity: robots of another size move alike at equal Froude numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco.batch", reason="training needs MuJoCo's batch")
+
+from quadvel_training.gait_clock import GaitClock, duty_factor, step_frequency
+from quadvel_training.similarity import REFERENCE_HEIGHT_M, Size
+from tests.helpers.robots import ALIENGO, GO2
+
+
+def test_the_size_is_that_of_the_height_of_the_hips_in_the_nominal_posture():
+    # thigh and calf of the Go2: 0.213 m each, at 0.8 and -0.8 rad to the vertical
+    assert Size.of(GO2).length == pytest.approx(2 * 0.213 * np.cos(0.8) / REFERENCE_HEIGHT_M, rel=1e-6)
+    assert Size.of(ALIENGO).length == pytest.approx(1.0, rel=1e-4)
+
+
+def test_velocities_that_are_alike_have_the_same_froude_number():
+    small, velocity = Size(0.25), np.array([[1.0, -0.5, 2.0]])
+    alike = small.as_reference(velocity)
+    height = np.array([0.25, 0.25]) * REFERENCE_HEIGHT_M
+    assert alike[0, :2] ** 2 / REFERENCE_HEIGHT_M == pytest.approx(velocity[0, :2] ** 2 / height)
+    assert alike[0, 2] ** 2 * REFERENCE_HEIGHT_M == pytest.approx(velocity[0, 2] ** 2 * height[0])
+
+
+def test_a_robot_of_a_quarter_of_the_size_steps_twice_as_often_at_half_the_speed():
+    small, large = GaitClock(2, Size(0.25)), GaitClock(2)
+    large.velocity = np.array([[1.2, 0.0, 0.5], [0.0, 0.4, 0.0]])
+    small.velocity = large.velocity * [0.5, 0.5, 2.0]
+    assert small.frequency == pytest.approx(2.0 * step_frequency(large.velocity))
+    assert small.duty == pytest.approx(duty_factor(large.velocity))
+    assert small.shortest_swing == pytest.approx(0.5 * large.shortest_swing)
+
+
+def test_its_plan_reaches_the_speed_that_is_alike_in_half_the_time():
+    small, large, none = GaitClock(1, Size(0.25)), GaitClock(1), np.zeros((1, 4), bool)
+    command = np.array([[1.0, 0.5, 2.0, 0.0]])
+    for _ in range(7):
+        large.advance(command, np.zeros(1), none, 0.02)
+        small.advance(command * [0.5, 0.5, 2.0, 1.0], np.zeros(1), none, 0.01)
+    assert small.velocity == pytest.approx(large.velocity * [0.5, 0.5, 2.0])
+    assert small.phase == pytest.approx(large.phase)
