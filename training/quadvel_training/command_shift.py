@@ -7,8 +7,9 @@ in integral control, until there is none. It is a smooth function of the command
 
     shift(c) = W phi(c),   W <- W + gain argmin_V sum_i w_i |e_i - V phi(c_i)|^2 + ridge |V|^2
 
-where e_i is the command minus the velocity of a robot that the student drives, and phi are the
-monomials of vx, vy and yaw rate up to the third degree. Errors are bounded, so that few robots that
+where e_i is the command minus the velocity of a robot that the student drives, without exploration:
+a robot that explores is slower. phi are piecewise linear functions of vx, vy and yaw rate and the
+products of these up to the third degree. Errors are bounded, so that few robots that
 slip or carry much do not shift all others. All processes of a run share the shift. Weights w_i fall
 with the command: at the fastest ones robots fall before they are steady. The mirrored command gets the mirrored shift.
 """
@@ -27,7 +28,18 @@ SCALES = np.array([2.0, 1.0, 3.0])  # m/s, m/s, rad/s: commands of usual size, s
 MAX_ERROR = np.array([0.1, 0.1, 0.2])  # m/s, m/s, rad/s: larger ones count as this
 MAX_SHIFT = np.array([0.3, 0.3, 0.6])  # m/s, m/s, rad/s
 MIRROR = np.array([1.0, -1.0, -1.0])  # of vx, vy and yaw rate, left for right
-MONOMIALS = [axes for degree in (1, 2, 3) for axes in combinations_with_replacement(range(3), degree)]
+KNOTS = (
+    np.array([-4.0, -3.0, -2.0, -1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0]),
+    np.array([-2.0, -1.0, -0.4, 0.0, 0.4, 1.0, 2.0]),
+    np.array([-6.0, -4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0, 6.0]),
+)  # m/s, m/s, rad/s: between them the shift of a command along one axis is linear
+PRODUCTS = [
+    axes
+    for degree in (2, 3)
+    for axes in combinations_with_replacement(range(3), degree)
+    if len(set(axes)) > 1
+]
+FEATURES = sum(len(knots) - 1 for knots in KNOTS) + len(PRODUCTS)
 GAIN = 0.6  # share of the mean error by which the shift grows
 RIDGE = 20.0  # robots that walk at the usual commands with no error
 
@@ -46,13 +58,13 @@ class CommandShift:
             every: calls of `add` from one change of the shift to the next.
         """
         self.every = every
-        self._weights = np.zeros((len(MONOMIALS), 3))
+        self._weights = np.zeros((FEATURES, 3))
         self._start_over()
 
     def _start_over(self) -> None:
         """Forget the errors since the last change."""
-        size = len(MONOMIALS)
-        self._calls, self._squares, self._products = 0, np.zeros((size, size)), np.zeros((size, 3))
+        self._calls = 0
+        self._squares, self._products = np.zeros((FEATURES, FEATURES)), np.zeros((FEATURES, 3))
 
     def of(self, command: np.ndarray) -> np.ndarray:
         """Evaluate the shift.
@@ -85,7 +97,7 @@ class CommandShift:
             squares, products = (
                 process_group.mean(torch.from_numpy(sums)).numpy() for sums in (self._squares, self._products)
             )
-            self._weights += GAIN * np.linalg.solve(squares + RIDGE * np.eye(len(MONOMIALS)), products)
+            self._weights += GAIN * np.linalg.solve(squares + RIDGE * np.eye(FEATURES), products)
             self._start_over()
 
     def state(self) -> dict[str, Any]:
@@ -107,6 +119,11 @@ class CommandShift:
 
 
 def _features(command: np.ndarray) -> np.ndarray:
-    """Monomials (n, F) of commands (n, 3 or more)."""
+    """Features (n, FEATURES) of commands (n, 3 or more): 0 for a command of 0."""
     scaled = command[:, :3] / SCALES
-    return np.stack([scaled[:, list(axes)].prod(axis=1) for axes in MONOMIALS], axis=1)
+    hats = [
+        np.interp(command[:, axis], knots, (knots == knot).astype(float))
+        for axis, knots in enumerate(KNOTS)
+        for knot in knots[knots != 0.0]
+    ]
+    return np.stack([*hats, *(scaled[:, list(axes)].prod(axis=1) for axes in PRODUCTS)], axis=1)

@@ -46,7 +46,7 @@ from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, CheckpointError, cosine, linear, load, set_rate
 from .networks import MEMORY, Recurrent, State, lengthen_memory, select
 from .onnx_file import commit, export
-from .past import Past
+from .past import Past, velocity_error
 from .ppo import IMITATION_HUBER_DELTA, masked_mean
 from .privileged import ACTION_BOUND, ACTION_SCALE
 from .randomisation import Randomisation, load_actuator
@@ -56,6 +56,8 @@ HOLD_TICKS = round(SAMPLE_S / TICK_S)  # the teacher learned with actions held f
 PAST_SIZE = 3 + 3 + 2 + 5  # what the teacher observes of the past
 LEVEL_SLOPE = 0.05  # m/m: steady errors on steeper ground do not shift commands
 SLOW_CELLS, LONGEST_MEMORY_S = MEMORY // 4, 4.0  # cells of a new student that forget slowly, up to this time
+SHORTEST_STEADY_S = 0.5  # of a sequence in which a robot is steady, for its mean error to count
+QUIET = 2  # every second robot does not explore
 AVERAGED_TICKS = 3
 """Ticks over which the teacher's actions are averaged: held actions act late by as much"""
 SHIFT_SEQUENCES = 8  # from one change of the shifted commands to the next: a million samples of 512 robots
@@ -79,7 +81,8 @@ class DaggerConfig:
         first_driven: the same at the start.
         takeover: samples from `first_driven` to `driven`.
         recall: weight of the squared error of a linear map from the memory to the past features.
-        noise: standard deviation of the noise of every action, in the network's unit.
+        noise: standard deviation of the noise of the actions of robots that explore, in the network's
+            unit.
         noise_time: s, time constant of the noise.
         timestep: s, of the physics.
         actuator: `eam`, `limited`, `rated`, `ideal`, or an actuator file.
@@ -260,6 +263,7 @@ class DaggerRun:
         self._memory: State = self.student.initial_state(c.n)
         self._previous = np.zeros((c.n, 12), np.float32)
         self._noise = np.zeros((c.n, 12), np.float32)
+        self._explores = np.arange(c.n) % QUIET > 0
         self._turn = np.random.default_rng(c.seed).permutation(c.n) / c.n  # order of takeover
         self.driven = self._turn < self._share()
 
@@ -353,12 +357,13 @@ class DaggerRun:
         decay = np.float32(np.exp(-TICK_S / c.noise_time))
         drawn_std = np.float32(c.noise * np.sqrt(1 - decay**2))
         alive, fell = np.ones(c.n, bool), np.zeros(c.n, bool)
+        drift, steady_s = np.zeros((c.n, 3)), np.zeros(c.n)  # integral of steady errors, and its time
         rows: dict[str, list[np.ndarray]] = {name: [] for name in attrs.fields_dict(Experience)}
         for _ in range(c.length):
             obs, label = observe(env, self._previous), self.teacher.action()
             own = self._act(obs)
             drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
-            self._noise = decay * self._noise + drawn_std * drawn
+            self._noise = decay * self._noise + drawn_std * drawn * self._explores[:, None]
             self._previous = np.where(self.driven[:, None], own, label) + self._noise
             seen = obs, label, self.teacher.past_features(), alive.copy()
             for values, value in zip(rows.values(), seen, strict=True):
@@ -366,15 +371,26 @@ class DaggerRun:
             command = env.command.copy()
             env.tick(self.map.targets(self._previous))
             self.teacher.advance(command, self._previous)
+            steady = self._steady(command)
+            steady_s += TICK_S * steady
+            drift += TICK_S * steady[:, None] * velocity_error(env, command)
             fell |= env.fallen & alive
             alive &= ~(env.fallen | env.timed_out)
-        steady = self.driven & alive & self.teacher.past.settled & (env.command[:, 3] < 0.5)
-        steady &= np.hypot(*env.ground_slope.T) < LEVEL_SLOPE  # a slope is no error of the student
-        self.teacher.shift.add(env.command[steady], self.teacher.stride_error()[steady])
+        counts = alive & self.teacher.past.settled & (steady_s > SHORTEST_STEADY_S)
+        self.teacher.shift.add(env.command[counts], drift[counts] / steady_s[counts, None])
         rows["mask"][-1] = alive  # robots that end in the last tick count as ended, too
         self.samples += c.length * c.n * process_group.size()
         tensors = [torch.from_numpy(np.array(values, dtype=np.float32)) for values in rows.values()]
         return Experience(*tensors), self._figures(alive, fell)
+
+    def _steady(self, command: np.ndarray) -> np.ndarray:
+        """Whether the errors of robots (n,) show what the student does at a command, and not what else happens.
+
+        The student drives them without exploration, the plan has the command for long, and the ground
+        is level: robots that explore or climb are slower.
+        """
+        steady = self.driven & ~self._explores & self.teacher.past.settled & (command[:, 3] < 0.5)
+        return np.asarray(steady & (np.hypot(*self.env.ground_slope.T) < LEVEL_SLOPE))
 
     def _figures(self, alive: np.ndarray, fell: np.ndarray) -> dict[str, float]:
         """Return errors over a stride (m/s, rad/s) and falls per robot-minute, by driver."""
