@@ -60,3 +60,15 @@ def test_a_resumed_run_goes_on_with_its_shift() -> None:
     first.add(command, 0.1 * command[:, :3])
     second.restore(first.state())
     np.testing.assert_array_equal(second.of(command), first.of(command))
+
+
+def test_an_error_at_one_speed_is_removed_there_and_not_at_twice_the_speed() -> None:
+    shift = CommandShift(every=1)
+    command = np.zeros((900, 4))
+    command[:, 0] = np.repeat([0.5, 1.0, 1.5], 300)
+    for _ in range(30):
+        error = np.zeros((900, 3))
+        error[:300, 0] = 0.05 - shift.of(command)[:300, 0]
+        error[300:, 0] = -shift.of(command)[300:, 0]
+        shift.add(command, error)
+    assert shift.of(command)[::300, 0] == pytest.approx([0.05, 0.0, 0.0], abs=2e-3)

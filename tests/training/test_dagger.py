@@ -142,3 +142,23 @@ def test_a_killed_run_resumes(run, teacher_file, tmp_path):
     assert other.samples == run.samples == 48
     for one, two in zip(run.student.parameters(), other.student.parameters(), strict=True):
         assert torch.equal(one, two)
+
+
+def test_every_second_robot_does_not_explore(run):
+    run.collect()
+    assert not run._noise[::2].any()
+    assert run._noise[1::2].any(axis=1).all()
+
+
+def test_commands_are_shifted_by_steady_errors_of_the_student_on_level_ground_alone(run, monkeypatch):
+    command = np.tile([0.5, 0.0, 0.0, 0.0], (8, 1))
+    command[2, 3] = 1.0  # stands
+    run.driven[:] = True
+    run.driven[4] = False
+    run.teacher.past._age[:] = 5.0
+    slope = np.zeros((8, 2))
+    slope[6] = 0.1
+    monkeypatch.setattr(type(run.env), "ground_slope", slope)
+    assert np.flatnonzero(run._steady(command)).tolist() == [0]
+    run.teacher.past._age[0] = 0.5  # the plan has just reached the command
+    assert not run._steady(command).any()
