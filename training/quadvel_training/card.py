@@ -14,6 +14,8 @@ from typing import Any
 
 from quadvel_description.network_file import metadata_texts, read_network
 from quadvel_description.recurrent_network import METADATA_KEY
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import UNNAMED_ROBOT
 from quadvel_estimator.features import KIND
 from quadvel_eval.compare import comparison_figures, read_evaluation
 
@@ -47,7 +49,7 @@ def card(network: Path, evaluations: Sequence[Path], paper: Path | None = None) 
         [
             f"# {network.name}",
             "",
-            ESTIMATOR if estimator else POLICY,
+            (ESTIMATOR if estimator else POLICY).format(robot=_title(metadata)),
             f"Written by `python -m quadvel_training card` from the file (SHA-256 {digest}...) and evaluations; do not edit.",
             "",
             *_table("how it was made", "", _origin(metadata)),
@@ -64,8 +66,13 @@ def card(network: Path, evaluations: Sequence[Path], paper: Path | None = None) 
     )
 
 
-POLICY = "A recurrent policy for velocity tracking of the AlienGo, one step at 200 Hz; metadata in the file say how to run it."
-ESTIMATOR = "A recurrent estimator of the AlienGo's linear velocity from IMU, encoders and torques, one step at 200 Hz."
+POLICY = "A recurrent policy for velocity tracking of the {robot}, one step at 200 Hz; metadata in the file say how to run it."
+ESTIMATOR = "A recurrent estimator of the {robot}'s linear velocity from IMU, encoders and torques, one step at 200 Hz."
+
+
+def _title(metadata: Json) -> str:
+    """Return the title of the robot that a file belongs to."""
+    return load_robot(metadata.get("robot", UNNAMED_ROBOT)).title
 
 
 def _metadata(network: Path) -> dict[str, Any]:
