@@ -41,7 +41,7 @@ PRODUCTS = [
 ]
 FEATURES = sum(len(knots) - 1 for knots in KNOTS) + len(PRODUCTS)
 GAIN = 0.6  # share of the mean error by which the shift grows
-RIDGE = 20.0  # robots that walk at the usual commands with no error
+RIDGE = 5.0  # robots that walk at the usual commands with no error
 
 
 class CommandShift:
