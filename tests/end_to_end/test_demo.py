@@ -54,6 +54,16 @@ def test_a_short_demo_walks_without_a_fall_and_judges_itself(out: Path) -> None:
     assert {"demo.mcap", "summary.json", "demo.png", "loop.png"} <= {path.name for path in out.iterdir()}
 
 
+def test_a_go2_walks_as_well(tmp_path: Path) -> None:
+    command = [*QUADVEL, "demo", "--robot", "go2", "--quick", "--lockstep", "--no-video", "--out", str(tmp_path)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["falls"] == 0
+    assert summary["max_error_xy"] < 0.15
+    assert max(summary["estimator"]["rmse"]) < 0.08
+
+
 def test_a_demo_whose_robot_cannot_stand_up_ends_with_its_cause_and_exit_code_1(tmp_path: Path) -> None:
     weak = tmp_path / "weak.yaml"
     attrs.evolve(ActuatorParameters.of(ALIENGO), torque_limit=2.0).save(weak)

@@ -133,6 +133,7 @@ LEFT_OUT = {
     "quadvel teleop": "tests/end_to_end/test_operator.py types its keys",
     "quadvel teleop gamepad": "needs a gamepad; tests/quadvel_view/test_hands.py has its events",
     "quadvel demo": "tests/end_to_end/test_demo.py runs it",
+    "quadvel demo --robot go2": "the same",
     "quadvel pause": "tests/end_to_end/test_operator.py pauses the robot",
     "quadvel pause --off": "the same",
     "quadvel step 20": "the same",

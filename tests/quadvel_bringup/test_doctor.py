@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 from importlib import metadata
+from pathlib import Path
 
 import pytest
 
 from quadvel_bringup import doctor
 from quadvel_bringup.doctor import Finding
 from quadvel_bringup.version import version
+from tests.helpers.robots import write_third_robot
 
 GOOD = [Finding(name, True, "1.0") for name in ("Python", *doctor.REQUIRED_PACKAGES, "GL", "ffmpeg")]
 
@@ -72,13 +74,19 @@ def test_an_rclpy_too_old_for_real_time_on_two_cores_is_named(monkeypatch: pytes
     ("robot", "good", "text"),
     [
         ("aliengo", True, "AlienGo: crl_eam.onnx, estimator.onnx"),
-        ("go2", False, "no policy is shipped for the robot 'go2'"),
+        ("go2", True, "Go2: crl_eam.onnx, estimator.onnx"),
         ("spot", False, "robot: found 'spot', expected aliengo, go2 or the path of a robot.yaml"),
     ],
 )
 def test_what_is_shipped_for_a_robot_is_named(robot: str, good: bool, text: str) -> None:
     finding = doctor.robot_files(robot)
     assert (finding.good, text in finding.text) == (good, True), finding
+
+
+def test_a_robot_without_a_policy_is_named(tmp_path: Path) -> None:
+    finding = doctor.robot_files(str(write_third_robot(tmp_path)))
+    assert not finding.good
+    assert "no policy is shipped for the robot 'third'" in finding.text
 
 
 def test_a_report_shows_versions_and_system_and_no_name_of_a_user(monkeypatch: pytest.MonkeyPatch) -> None:

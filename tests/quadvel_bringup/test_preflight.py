@@ -13,6 +13,7 @@ from quadvel_bringup.preflight import NODE_CHECKS, check_arguments, check_stack
 from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
 from quadvel_description.robot import load_robot
 from quadvel_policy.policy_file import SHIPPED_POLICY
+from tests.helpers.robots import write_third_robot
 
 
 @pytest.fixture(autouse=True)
@@ -37,6 +38,23 @@ def test_the_shipped_stack_is_in_order() -> None:
 
 def test_a_robot_without_a_policy_may_stand() -> None:
     check_stack(Stack(robot="go2", policy=Path("none"), estimator="kalman"))
+
+
+@pytest.mark.parametrize(
+    ("choice", "sentence"),
+    [
+        ({}, "no policy is shipped for the robot 'third': name one with --policy FILE"),
+        (
+            {"policy": Path("none")},
+            "no velocity estimator is shipped for the robot 'third': .* --estimator kalman",
+        ),
+    ],
+)
+def test_a_robot_without_shipped_networks_needs_those_of_the_user(
+    tmp_path: Path, choice: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(FileNotFoundError, match=sentence):
+        check_stack(Stack(robot=str(write_third_robot(tmp_path)), **choice))
 
 
 @pytest.mark.parametrize("low_level", ["driver", "board"])
@@ -69,14 +87,6 @@ def test_a_robot_without_a_board_that_is_known_here_has_no_driver(tmp_path: Path
         (
             {"robot": "spot", "low_level": "external"},
             "robot: found 'spot', expected aliengo, go2 or the path of a robot.yaml",
-        ),
-        (
-            {"robot": "go2", "low_level": "driver"},
-            "no policy is shipped for the robot 'go2': name one with --policy FILE",
-        ),
-        (
-            {"robot": "go2", "low_level": "driver", "policy": Path("none")},
-            "no velocity estimator is shipped for the robot 'go2': .* --estimator kalman",
         ),
         (
             {"robot": "go2", "low_level": "driver", "estimator": "kalman", "policy": SHIPPED_POLICY},
