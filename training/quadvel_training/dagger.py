@@ -54,7 +54,7 @@ from .walking_rewards import SAMPLE_S, error_magnitudes
 
 HOLD_TICKS = round(SAMPLE_S / TICK_S)  # the teacher learned with actions held for so long
 PAST_SIZE = 3 + 3 + 2 + 5  # what the teacher observes of the past
-LEVEL_SLOPE = 0.05  # m/m: steady errors on steeper ground do not shift commands
+LEVEL_SLOPE = 0.1  # m/m: steady errors on steeper ground do not shift commands
 SLOW_CELLS, LONGEST_MEMORY_S = MEMORY // 4, 4.0  # cells of a new student that forget slowly, up to this time
 SHORTEST_STEADY_S = 0.5  # of a sequence in which a robot is steady, for its mean error to count
 QUIET = 2  # every second robot does not explore
