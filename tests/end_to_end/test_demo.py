@@ -55,7 +55,17 @@ def test_a_short_demo_walks_without_a_fall_and_judges_itself(out: Path) -> None:
 
 
 def test_a_go2_walks_as_well(tmp_path: Path) -> None:
-    command = [*QUADVEL, "demo", "--robot", "go2", "--quick", "--lockstep", "--no-video", "--out", str(tmp_path)]
+    command = [
+        *QUADVEL,
+        "demo",
+        "--robot",
+        "go2",
+        "--quick",
+        "--lockstep",
+        "--no-video",
+        "--out",
+        str(tmp_path),
+    ]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=240)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     summary = json.loads((tmp_path / "summary.json").read_text())
