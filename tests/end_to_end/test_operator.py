@@ -238,7 +238,8 @@ def test_the_simulator_is_paused_and_stepped(up: Robot) -> None:
     assert code == 1
     assert "is the simulator paused?" in text
     assert quadvel("pause", "--off") == (0, "running\n")
-    assert quadvel("drive", "--vx", "0.3", "--seconds", "2")[0] == 0  # the pause was no fault
+    code, text = quadvel("drive", "--vx", "0.3", "--seconds", "2")
+    assert code == 0, text  # the pause was no fault
     code, text = quadvel("step")
     assert code == 1
     assert "pause it first" in text
