@@ -96,6 +96,25 @@ def test_the_teachers_actions_lag_as_held_ones_do_and_restart_with_a_robot(run, 
     assert teacher.action()[[0, 5], 0] == pytest.approx([0.9, 1.2])
 
 
+def test_a_label_is_the_mean_of_the_actions_around_its_tick_while_the_robot_is_up():
+    actions = np.random.default_rng(0).standard_normal((30, 2, 12)).astype(np.float32)
+    mask = np.ones((30, 2), np.float32)
+    mask[20:, 1] = 0.0
+    labels = dagger.smooth_labels(actions, mask)
+    before, after = dagger.LABEL_BEFORE, dagger.LABEL_AFTER
+    assert labels[10, 0] == pytest.approx(actions[10 - before : 11 + after, 0].mean(axis=0), abs=1e-6)
+    assert labels[0, 0] == pytest.approx(actions[: 1 + after, 0].mean(axis=0), abs=1e-6)
+    assert labels[19, 1] == pytest.approx(actions[19 - before : 20, 1].mean(axis=0), abs=1e-6)
+    assert labels[29, 0] == pytest.approx(actions[29 - before :, 0].mean(axis=0), abs=1e-6)
+
+
+def test_labels_do_not_jump_where_the_teacher_does():
+    jump = np.zeros((30, 1, 12), np.float32)
+    jump[15:] = 1.0
+    steps = np.diff(dagger.smooth_labels(jump, np.ones((30, 1), np.float32))[:, 0, 0])
+    assert steps.max() == pytest.approx(1 / (1 + dagger.LABEL_BEFORE + dagger.LABEL_AFTER))
+
+
 def test_who_drives_changes_with_an_episode_alone(run):
     before = run.driven.copy()
     run.samples = 10**9  # the student is to drive nearly all

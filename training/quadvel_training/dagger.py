@@ -59,7 +59,9 @@ SLOW_CELLS, LONGEST_MEMORY_S = MEMORY // 4, 4.0  # cells of a new student that f
 SHORTEST_STEADY_S = 0.5  # of a sequence in which a robot is steady, for its mean error to count
 QUIET = 2  # every second robot does not explore
 AVERAGED_TICKS = 3
-"""Ticks over which the teacher's actions are averaged: held actions act late by as much"""
+"""Ticks over which a teacher that drives averages its actions: held actions act late by as much"""
+LABEL_BEFORE, LABEL_AFTER = 5, 3
+"""Ticks before and after its own that a label averages: as late as `AVERAGED_TICKS`, and without jumps"""
 SHIFT_SEQUENCES = 8  # from one change of the shifted commands to the next: a million samples of 512 robots
 
 
@@ -123,7 +125,7 @@ class Experience:
 
     Attributes:
         obs: (T, N, 48), observations.
-        label: (T, N, 12), actions of the teacher.
+        label: (T, N, 12), actions of the teacher, averaged over `LABEL_BEFORE` to `LABEL_AFTER`.
         past: (T, N, PAST_SIZE), what the teacher observes of the past.
         mask: (T, N), 1 for robots that are up.
     """
@@ -146,6 +148,7 @@ class Teacher:
         env: environments.
         shift: what it follows beyond the commands.
         past: past of the robots, relative to the shifted commands.
+        latest: (n, 12), last action before the average, in the network's unit.
     """
 
     def __init__(self, checkpoint: dict[str, Any], env: VelocityEnv, shift: CommandShift) -> None:
@@ -162,6 +165,7 @@ class Teacher:
         self._executed = deque([np.zeros((n, 12), np.float32) for _ in range(HOLD_TICKS)], HOLD_TICKS)
         self._recent = np.zeros((AVERAGED_TICKS, n, 12), np.float32)  # newest first
         self._starts = np.ones(n, bool)
+        self.latest = np.zeros((n, 12), np.float32)
 
     def reset(self, ids: np.ndarray, other_pair: np.ndarray | bool = False) -> None:
         """Clear the past of some robots.
@@ -185,7 +189,7 @@ class Teacher:
         obs = privileged.observe(self.env, self.past, self._executed[0], command)
         with torch.no_grad():
             correction: np.ndarray = self.actor(torch.from_numpy(obs))[0].numpy()
-        now = privileged.total_action(self.env, self.past, correction)
+        self.latest = now = privileged.total_action(self.env, self.past, correction)
         self._recent = np.concatenate([now[None], self._recent[:-1]])
         self._recent[:, self._starts] = now[self._starts]
         self._starts[:] = False
@@ -360,12 +364,12 @@ class DaggerRun:
         drift, steady_s = np.zeros((c.n, 3)), np.zeros(c.n)  # integral of steady errors, and its time
         rows: dict[str, list[np.ndarray]] = {name: [] for name in attrs.fields_dict(Experience)}
         for _ in range(c.length):
-            obs, label = observe(env, self._previous), self.teacher.action()
+            obs, advice = observe(env, self._previous), self.teacher.action()
             own = self._act(obs)
             drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
             self._noise = decay * self._noise + drawn_std * drawn * self._explores[:, None]
-            self._previous = np.where(self.driven[:, None], own, label) + self._noise
-            seen = obs, label, self.teacher.past_features(), alive.copy()
+            self._previous = np.where(self.driven[:, None], own, advice) + self._noise
+            seen = obs, self.teacher.latest, self.teacher.past_features(), alive.copy()
             for values, value in zip(rows.values(), seen, strict=True):
                 values.append(value)
             command = env.command.copy()
@@ -380,8 +384,10 @@ class DaggerRun:
         self.teacher.shift.add(env.command[counts], drift[counts] / steady_s[counts, None])
         rows["mask"][-1] = alive  # robots that end in the last tick count as ended, too
         self.samples += c.length * c.n * process_group.size()
-        tensors = [torch.from_numpy(np.array(values, dtype=np.float32)) for values in rows.values()]
-        return Experience(*tensors), self._figures(alive, fell)
+        arrays = {name: np.array(values, dtype=np.float32) for name, values in rows.items()}
+        arrays["label"] = smooth_labels(arrays["label"], arrays["mask"])
+        tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        return Experience(**tensors), self._figures(alive, fell)
 
     def _steady(self, command: np.ndarray) -> np.ndarray:
         """Whether the errors of robots (n,) show what the student does at a command, and not what else happens.
@@ -434,6 +440,31 @@ class DaggerRun:
             losses.append((float(imitation.detach()), float(recall.detach())))
         imitation_mean, recall_mean = np.mean(losses, axis=0)
         return {"imitation": float(imitation_mean), "recall": float(recall_mean)}
+
+
+def smooth_labels(actions: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Average the teacher's actions around each tick.
+
+    The teacher's targets jump where it plans a touchdown or a lift-off, and its student would copy the
+    jumps. It sees them come, so actions after a tick count as well: the mean is no later than the
+    causal one with which the teacher drives.
+
+    Args:
+        actions: (T, N, 12), actions of the teacher.
+        mask: (T, N), 1 for robots that are up; actions of others do not count.
+
+    Returns:
+        (T, N, 12), means over `LABEL_BEFORE` ticks before to `LABEL_AFTER` after, as far as there are.
+    """
+    ticks = np.arange(len(actions))
+    first, last = np.maximum(ticks - LABEL_BEFORE, 0), np.minimum(ticks + LABEL_AFTER, len(actions) - 1)
+
+    def window_sum(values: np.ndarray) -> np.ndarray:
+        running = np.concatenate([np.zeros_like(values[:1], float), values.cumsum(axis=0, dtype=float)])
+        return np.asarray(running[last + 1] - running[first])
+
+    count = np.maximum(window_sum(mask[..., None]), 1.0)
+    return np.asarray(window_sum(actions * mask[..., None]) / count, np.float32)
 
 
 def load_policy(checkpoint: Path) -> Recurrent:
