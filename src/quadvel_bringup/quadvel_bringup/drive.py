@@ -27,6 +27,8 @@ PUBLISH_PERIOD_S = 0.05
 """Time between two messages; the command mux drops a source after 0.5 s."""
 SETTLING_TIME_S = 0.5
 """Time after the command is in full effect before the measured velocity is averaged."""
+READY_TIMEOUT_S = 1.0
+"""Time for a robot that just stood up, or was paused, to follow velocities again."""
 SAME_TOLERANCE = 1e-3
 """Largest difference of equal commands, m/s or rad/s."""
 MAX_ESTIMATES = 10_000
@@ -70,8 +72,8 @@ class DriveRun:
         if self._signals.received:
             return ""
         self._wait(lambda: self._states[-1].mode_name != "stand_up", MODE_TIMEOUT_S)
-        # After standing up, the controller waits for the mux's zero command.
-        self._wait(lambda: not self._states[-1].walk_refusal, PUBLISH_PERIOD_S * 4)
+        # After standing up, the controller waits for the mux's zero command; after a pause, for states.
+        self._wait(lambda: self._states[-1].mode_name == "fault" or not self.refusal(), READY_TIMEOUT_S)
         return self.refusal()
 
     def _wait(self, is_so: Callable[[], Any], seconds: float) -> bool:
