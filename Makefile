@@ -64,8 +64,7 @@ pictures: $(VENV)/.test  ## take the pictures of the documents again; needs an i
 	$(PY) docs/pictures.py
 
 faults: setup  ## inject faults into a simulated robot and measure its reaction; results in out/faults
-	$(VENV)/bin/quadvel faults --out out/faults
-	$(VENV)/bin/python -m quadvel_lab.topic_faults
+	$(VENV)/bin/quadvel faults --out out/faults; code=$$?; $(VENV)/bin/python -m quadvel_lab.topic_faults && exit $$code
 
 bench: setup  ## measure the speed of this machine; results in out/bench.json
 	$(VENV)/bin/quadvel bench --out out/bench.json

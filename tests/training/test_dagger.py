@@ -134,15 +134,15 @@ def test_the_student_gets_its_share_as_soon_as_it_grows(run):
 
 def test_the_student_learns_to_imitate_the_teacher_and_to_recall_the_past(run):
     start = run._memory
-    experience, _ = run.collect()
-    losses = [run.learn(experience, start) for _ in range(25)]
+    experience, standing, _ = run.collect()
+    losses = [run.learn(experience.with_mirror_images(standing), start) for _ in range(25)]
     assert losses[-1]["imitation"] < 0.5 * losses[0]["imitation"]
     assert losses[-1]["recall"] < 0.5 * losses[0]["recall"]
 
 
 def test_a_robot_that_fell_teaches_nothing_until_it_starts_over(run):
     run.env._qpos[3, 2] = 0.05
-    experience, _ = run.collect()
+    experience, *_ = run.collect()
     mask = experience.mask
     assert mask[0, 3] == 1.0
     assert (mask[1:, 3] == 0.0).all()
@@ -151,6 +151,25 @@ def test_a_robot_that_fell_teaches_nothing_until_it_starts_over(run):
     assert (run._memory[0][0, 3] == 0.0).all()
     assert torch.equal(run._memory[0][0, 0], memory[0][0, 0])
     assert not run.env.fallen[3]
+
+
+def test_the_student_learns_mirror_images_of_robots_that_do_not_stand(run):
+    start = run._memory
+    experience, standing, _ = run.collect()
+    standing[2:4, 5] = 1.0
+    both = experience.with_mirror_images(standing)
+    assert both.mask[:, : SMALL.n].equal(experience.mask)
+    assert both.mask[:, SMALL.n :].equal(experience.mask * (1 - standing))
+    left, right = (
+        both.label[:, 0].unflatten(-1, (4, 3))[:, 0],
+        both.label[:, SMALL.n].unflatten(-1, (4, 3))[:, 1],
+    )
+    assert left.equal(right * torch.tensor([-1.0, 1.0, 1.0]))  # FR as FL
+    assert both.past[:, SMALL.n, 6:8].equal(experience.past[:, 0, 6:8] * torch.tensor([1.0, -1.0]))  # lag
+    _, end = run.student(both.obs, start)
+    assert (
+        run._memory[0].isclose(end[0], atol=1e-5).all()
+    )  # that of the mirror images saw what they learn from
 
 
 def test_a_killed_run_resumes(run, teacher_file, tmp_path):

@@ -12,6 +12,10 @@ The student has to remember what the teacher observes of the past: errors over a
 seconds, and the phase of its steps. So its sequences last for seconds, and a linear map from its
 memory, which is not part of the policy, learns to predict these numbers. What is left of its steady
 errors the teacher removes by shifted commands (`command_shift`).
+
+Half of the sequences are learned as their mirror images, so that the student walks alike to both
+sides. Robots that stand are left out there: whoever answers left and right alike cannot choose the
+foot to start with.
 """
 
 from __future__ import annotations
@@ -26,8 +30,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from quadvel_description import symmetry
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
+from quadvel_description.symmetry import Mirror
 from quadvel_policy.observation import (
     COMMAND_AXES,
     OBSERVATION_SIZE,
@@ -44,7 +50,7 @@ from .command_grid import CommandGrid, GridConfig
 from .command_shift import CommandShift
 from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, CheckpointError, cosine, linear, load, set_rate
-from .networks import MEMORY, Recurrent, State, lengthen_memory, select
+from .networks import MEMORY, Recurrent, State, lengthen_memory, select, torch_mirror
 from .onnx_file import commit, export
 from .past import Past, velocity_error
 from .ppo import IMITATION_HUBER_DELTA, masked_mean
@@ -53,7 +59,14 @@ from .randomisation import Randomisation, load_actuator
 from .walking_rewards import SAMPLE_S, error_magnitudes
 
 HOLD_TICKS = round(SAMPLE_S / TICK_S)  # the teacher learned with actions held for so long
-PAST_SIZE = 3 + 3 + 2 + 5  # what the teacher observes of the past
+PAST_SIGNS = np.array([1, -1, -1, 1, -1, -1, 1, -1, -1, -1, 1, -1, -1], float)
+PAST_SIZE = len(PAST_SIGNS)
+"""What the teacher observes of the past: errors over a stride, lasting ones, lag, phase, planned velocity"""
+MIRRORS = tuple(
+    torch_mirror(mirror)
+    for mirror in (symmetry.OBSERVATION, symmetry.JOINTS, Mirror(np.arange(PAST_SIZE), PAST_SIGNS))
+)
+"""Of observations, actions, and what the teacher observes of the past"""
 LEVEL_SLOPE = 0.1  # m/m: steady errors on steeper ground do not shift commands
 SLOW_CELLS, LONGEST_MEMORY_S = MEMORY // 4, 4.0  # cells of a new student that forget slowly, up to this time
 SHORTEST_STEADY_S = 0.5  # of a sequence in which a robot is steady, for its mean error to count
@@ -127,13 +140,30 @@ class Experience:
         obs: (T, N, 48), observations.
         label: (T, N, 12), actions of the teacher, averaged over `LABEL_BEFORE` to `LABEL_AFTER`.
         past: (T, N, PAST_SIZE), what the teacher observes of the past.
-        mask: (T, N), 1 for robots that are up.
+        mask: (T, N), 1 for robots that are up, and count.
     """
 
     obs: Tensor
     label: Tensor
     past: Tensor
     mask: Tensor
+
+    def with_mirror_images(self, standing: Tensor) -> Experience:
+        """Append the mirror image of each robot.
+
+        Args:
+            standing: (T, N), 1 for robots that stand, whose mirror images do not count.
+
+        Returns:
+            T ticks of 2 N robots, the mirror images last.
+        """
+        mirrored = [
+            mirror(own) for mirror, own in zip(MIRRORS, (self.obs, self.label, self.past), strict=True)
+        ]
+        pairs = zip(
+            attrs.astuple(self, recurse=False), [*mirrored, self.mask * (1.0 - standing)], strict=True
+        )
+        return Experience(*(torch.cat(pair, dim=1) for pair in pairs))
 
 
 class Teacher:
@@ -264,7 +294,7 @@ class DaggerRun:
         self.map = action_map(self.env)
         self.optimiser = torch.optim.Adam(self._learning().parameters(), lr=c.learning_rate)
         self.samples = 0
-        self._memory: State = self.student.initial_state(c.n)
+        self._memory: State = self.student.initial_state(2 * c.n)  # of robots, and of their mirror images
         self._previous = np.zeros((c.n, 12), np.float32)
         self._noise = np.zeros((c.n, 12), np.float32)
         self._explores = np.arange(c.n) % QUIET > 0
@@ -323,7 +353,7 @@ class DaggerRun:
         self._previous[ids] = self._noise[ids] = 0.0
         self._memory = (self._memory[0].clone(), self._memory[1].clone())
         for memory in self._memory:
-            memory[:, ids] = 0.0
+            memory[:, np.concatenate([ids, self.config.n + ids])] = 0.0
 
     def step(self, done: float) -> dict[str, float]:
         """Collect one sequence of every robot and learn from it.
@@ -337,24 +367,24 @@ class DaggerRun:
         c = self.config
         set_rate(self.optimiser, cosine(c.learning_rate, c.final_learning_rate, done))
         start = self._memory
-        experience, seen = self.collect()
-        seen |= self.learn(experience, start)
+        experience, standing, seen = self.collect()
+        seen |= self.learn(experience.with_mirror_images(standing), start)
         handed_over = self.driven != (self._turn < self._share())
         self._start_over(np.flatnonzero((experience.mask[-1].numpy() == 0.0) | handed_over))
         return seen
 
     def _act(self, obs: np.ndarray) -> np.ndarray:
         """Run the student for one tick; return its actions (n, 12)."""
+        own = torch.from_numpy(obs)
         with torch.no_grad():
-            action, self._memory = self.student(torch.from_numpy(obs[None]), self._memory)
-        own: np.ndarray = action[0].numpy()
-        return own
+            action, self._memory = self.student(torch.cat([own, MIRRORS[0](own)])[None], self._memory)
+        return np.asarray(action[0, : len(obs)].numpy())
 
-    def collect(self) -> tuple[Experience, dict[str, float]]:
+    def collect(self) -> tuple[Experience, Tensor, dict[str, float]]:
         """Collect one sequence of every robot.
 
         Returns:
-            The sequences, and figures for the log.
+            The sequences, (T, N) which robots stood, and figures for the log.
         """
         env, c = self.env, self.config
         # Ornstein-Uhlenbeck noise: n <- d n + noise sqrt(1 - d^2) w, d = exp(-dt / noise_time)
@@ -363,6 +393,7 @@ class DaggerRun:
         alive, fell = np.ones(c.n, bool), np.zeros(c.n, bool)
         drift, steady_s = np.zeros((c.n, 3)), np.zeros(c.n)  # integral of steady errors, and its time
         rows: dict[str, list[np.ndarray]] = {name: [] for name in attrs.fields_dict(Experience)}
+        standing = []
         for _ in range(c.length):
             obs, advice = observe(env, self._previous), self.teacher.action()
             own = self._act(obs)
@@ -372,6 +403,7 @@ class DaggerRun:
             seen = obs, self.teacher.latest, self.teacher.past_features(), alive.copy()
             for values, value in zip(rows.values(), seen, strict=True):
                 values.append(value)
+            standing.append(self.teacher.past.standing)
             command = env.command.copy()
             env.tick(self.map.targets(self._previous))
             self.teacher.advance(command, self._previous)
@@ -387,7 +419,8 @@ class DaggerRun:
         arrays = {name: np.array(values, dtype=np.float32) for name, values in rows.items()}
         arrays["label"] = smooth_labels(arrays["label"], arrays["mask"])
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-        return Experience(**tensors), self._figures(alive, fell)
+        stood = torch.from_numpy(np.array(standing, dtype=np.float32))
+        return Experience(**tensors), stood, self._figures(alive, fell)
 
     def _steady(self, command: np.ndarray) -> np.ndarray:
         """Whether the errors of robots (n,) show what the student does at a command, and not what else happens.
@@ -412,17 +445,20 @@ class DaggerRun:
         return seen
 
     def learn(self, experience: Experience, start: State) -> dict[str, float]:
-        """Take an optimiser step for each mini-batch of robots, in each pass.
+        """Take an optimiser step for each mini-batch of robots or their mirror images, in each pass.
 
         Args:
-            experience: one sequence of every robot.
-            start: memory of the student at the start of the sequence.
+            experience: one sequence of every robot, and of its mirror image.
+            start: memory of the student at the start of the sequences.
 
         Returns:
             Mean losses of the imitation and of the recall.
         """
         c, e = self.config, experience
-        passes = [torch.randperm(c.n).chunk(c.mini_batches) for _ in range(c.epochs)]
+        passes = [
+            (torch.randperm(c.n) + c.n * torch.randint(0, 2, (c.n,))).chunk(c.mini_batches)
+            for _ in range(c.epochs)
+        ]
         losses = []
         for ids in itertools.chain(*passes):
             memory, _ = self.student.lstm(e.obs[:, ids], select(start, ids))
