@@ -59,7 +59,7 @@ def test_the_pull_alone_brings_the_policy_to_its_teacher(files):
 
 def test_it_starts_as_its_student_and_resumes_from_a_checkpoint(files, tmp_path):
     run = ConstrainedRun(SMALL, *files)
-    known = loop.load(files[0])["student"]
+    known = loop.load(files[0])["average"]
     assert all(torch.equal(known[name], value) for name, value in run.policy().state_dict().items())
     run.step(0.0)
     loop.save(run.state(), tmp_path / "constrained.pt")

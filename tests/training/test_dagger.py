@@ -35,7 +35,7 @@ def run(teacher_file):
 
 
 def test_the_file_is_the_papers_network_and_nothing_else(run, tmp_path):
-    dagger.export_policy(run.student, run.env, run.grid.config.answered, tmp_path / "policy.onnx", {})
+    dagger.export_policy(run.average, run.env, run.grid.config.answered, tmp_path / "policy.onnx", {})
     model = onnx.load(tmp_path / "policy.onnx")
     assert len(model.graph.node) <= 40
     sizes = {x.name: [d.dim_value for d in x.type.tensor_type.shape.dim] for x in model.graph.input}
@@ -46,18 +46,18 @@ def test_the_file_is_the_papers_network_and_nothing_else(run, tmp_path):
 
 
 def test_the_file_does_what_the_network_does(run, tmp_path):
-    dagger.export_policy(run.student, run.env, run.grid.config.answered, tmp_path / "policy.onnx", {})
+    dagger.export_policy(run.average, run.env, run.grid.config.answered, tmp_path / "policy.onnx", {})
     policy = PolicyFile(ALIENGO, tmp_path / "policy.onnx")
     obs = np.random.default_rng(0).normal(size=(50, 48)).astype(np.float32)
     with torch.no_grad():
-        expected, _ = run.student(torch.from_numpy(obs[:, None]), run.student.initial_state(1))
+        expected, _ = run.average(torch.from_numpy(obs[:, None]), run.student.initial_state(1))
     found = np.array([policy.step(one).copy() for one in obs])
     assert np.abs(found - expected[:, 0].numpy()).max() < 1e-4
 
 
 def test_the_file_holds_its_command_limits_and_how_to_run_it(run, tmp_path):
     limits = VelocityCommandLimits((-1.0, -0.4, -0.7), (2.0, 0.5, 0.7), 3.0)
-    dagger.export_policy(run.student, run.env, limits, tmp_path / "policy.onnx", {})
+    dagger.export_policy(run.average, run.env, limits, tmp_path / "policy.onnx", {})
     metadata = PolicyFile(ALIENGO, tmp_path / "policy.onnx").metadata
     assert metadata.limits == limits
     assert np.allclose(metadata.action_offset, run.env.stand_q)
@@ -170,6 +170,15 @@ def test_the_student_learns_mirror_images_of_robots_that_do_not_stand(run):
     assert (
         run._memory[0].isclose(end[0], atol=1e-5).all()
     )  # that of the mirror images saw what they learn from
+
+
+def test_the_file_holds_the_mean_of_the_last_weights(run):
+    seen = []
+    for _ in range(3):
+        run.step(0.0)
+        seen.append(torch.nn.utils.parameters_to_vector(run.student.parameters()).detach().clone())
+    averaged = torch.nn.utils.parameters_to_vector(run.average.parameters())
+    assert averaged.isclose(torch.stack(seen).mean(dim=0), atol=1e-6).all()
 
 
 def test_a_killed_run_resumes(run, teacher_file, tmp_path):

@@ -36,7 +36,7 @@ def test_a_run_keeps_what_it_is_and_how_it_fared(tmp_path, monkeypatch, drives):
     setups = []
     monkeypatch.setattr(run_folder, "_evaluate", lambda setup: setups.append(setup) or figures)
     start, folder = tmp_path / "start.pt", tmp_path / "run"
-    loop.save({"student": Recurrent(48, 12).state_dict(), "samples": 7}, start)
+    loop.save({"average": Recurrent(48, 12).state_dict(), "samples": 7}, start)
     config = ConstrainedConfig(
         n=2, length=3, threads=1, keep=10, actuator=str(drives), budget=Budget(15, 1.0)
     )

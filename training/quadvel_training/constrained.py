@@ -28,7 +28,7 @@ from .command_grid import CommandGrid, GridConfig
 from .command_shift import CommandShift
 from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, TimeShares, linear, load
-from .networks import Gaussian, Mlp, Recurrent, State, torch_mirror
+from .networks import Gaussian, Mlp, Recurrent, State, follow_weights, torch_mirror
 from .past import Past, velocity_error
 from .ppo import RECURRENT_PPO, Ppo, PpoConfig, Rollout, exploration_scales
 from .privileged import CommandScorer
@@ -186,14 +186,6 @@ class ConstrainedRun:
         """
         return copy.deepcopy(self.average).cpu()
 
-    @torch.no_grad()  # type: ignore[untyped-decorator]
-    def _follow_weights(self) -> None:
-        """Update the running average of the policy's weights."""
-        # mean <- mean + (weights - mean) / min(updates, averaged)
-        share = 1.0 / min(self.updates, self.config.averaged)
-        for mean, now in zip(self.average.parameters(), self.actor.network.parameters(), strict=True):
-            mean.lerp_(now, share)
-
     def write_policy(self, path: Path, about: dict[str, Any]) -> None:
         """Write the averaged policy as a policy file.
 
@@ -258,7 +250,7 @@ class ConstrainedRun:
         actor_learns, compared = self.updates > c.critic_first, self.updates % AGREEMENT_UPDATES == 0
         with self.shares.measure("learning"):
             learned = self.ppo.update(rollout, actor_learns, pull, constraints, compared)
-            self._follow_weights()
+            follow_weights(self.average, self.actor.network, 1.0 / min(self.updates, c.averaged))
         return (
             seen
             | learned

@@ -20,6 +20,7 @@ foot to start with.
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections import deque
 from pathlib import Path
@@ -50,7 +51,7 @@ from .command_grid import CommandGrid, GridConfig
 from .command_shift import CommandShift
 from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, CheckpointError, cosine, linear, load, set_rate
-from .networks import MEMORY, Recurrent, State, lengthen_memory, select, torch_mirror
+from .networks import MEMORY, Recurrent, State, follow_weights, lengthen_memory, select, torch_mirror
 from .onnx_file import commit, export
 from .past import Past, velocity_error
 from .ppo import IMITATION_HUBER_DELTA, masked_mean
@@ -96,6 +97,8 @@ class DaggerConfig:
         first_driven: the same at the start.
         takeover: samples from `first_driven` to `driven`.
         recall: weight of the squared error of a linear map from the memory to the past features.
+        averaged: sequences over which the weights of the policy file are averaged; 16 are 2 million
+            samples of 512 robots.
         noise: standard deviation of the noise of the actions of robots that explore, in the network's
             unit.
         noise_time: s, time constant of the noise.
@@ -121,6 +124,7 @@ class DaggerConfig:
     first_driven: float = 0.2
     takeover: float = 2e6
     recall: float = 0.1
+    averaged: int = 16
     noise: float = 0.09
     noise_time: float = 0.05
     timestep: float = 0.0025
@@ -290,10 +294,11 @@ class DaggerRun:
         self.teacher = Teacher(checkpoint, self.env, CommandShift(SHIFT_SEQUENCES))
         self.student = Recurrent(OBSERVATION_SIZE, 12)
         lengthen_memory(self.student.lstm, SLOW_CELLS, LONGEST_MEMORY_S / TICK_S)
+        self.average = copy.deepcopy(self.student)
         self.recall = torch.nn.Linear(MEMORY, PAST_SIZE)
         self.map = action_map(self.env)
         self.optimiser = torch.optim.Adam(self._learning().parameters(), lr=c.learning_rate)
-        self.samples = 0
+        self.samples = self._sequences = 0
         self._memory: State = self.student.initial_state(2 * c.n)  # of robots, and of their mirror images
         self._previous = np.zeros((c.n, 12), np.float32)
         self._noise = np.zeros((c.n, 12), np.float32)
@@ -309,6 +314,8 @@ class DaggerRun:
         """
         return {
             "student": self.student.state_dict(),
+            "average": self.average.state_dict(),
+            "sequences": self._sequences,
             "recall": self.recall.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "grid": self.grid.state(),
@@ -324,6 +331,8 @@ class DaggerRun:
             state: what `state` returned.
         """
         self.student.load_state_dict(state["student"])
+        self.average.load_state_dict(state["average"])
+        self._sequences = state["sequences"]
         self.recall.load_state_dict(state["recall"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.teacher.shift.restore(state["shift"])
@@ -369,6 +378,8 @@ class DaggerRun:
         start = self._memory
         experience, standing, seen = self.collect()
         seen |= self.learn(experience.with_mirror_images(standing), start)
+        self._sequences += 1
+        follow_weights(self.average, self.student, 1.0 / min(self._sequences, c.averaged))
         handed_over = self.driven != (self._turn < self._share())
         self._start_over(np.flatnonzero((experience.mask[-1].numpy() == 0.0) | handed_over))
         return seen
@@ -510,14 +521,14 @@ def load_policy(checkpoint: Path) -> Recurrent:
         checkpoint: checkpoint of this stage or of `constrained`.
 
     Returns:
-        The network; of `constrained` the averaged one.
+        The network, with its weights averaged.
 
     Raises:
         FileNotFoundError: there is no such file.
         CheckpointError: the checkpoint has no policy.
     """
     content, network = load(checkpoint), Recurrent(OBSERVATION_SIZE, 12)
-    weights = content.get("average") or content.get("student")
+    weights = content.get("average") or content.get("student")  # which old checkpoints have alone
     if weights is None:
         raise CheckpointError(f"{checkpoint}: expected a checkpoint of `dagger` or of `constrained`")
     network.load_state_dict(weights)

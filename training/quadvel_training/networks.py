@@ -30,6 +30,21 @@ def select(state: State, ids: Tensor) -> State:
     return state[0][:, ids].contiguous(), state[1][:, ids].contiguous()
 
 
+@torch.no_grad()  # type: ignore[untyped-decorator]
+def follow_weights(average: nn.Module, network: nn.Module, share: float) -> None:
+    """Update a running average of a network's weights: mean <- mean + share (weights - mean).
+
+    Single steps of an optimiser leave steady errors that the mean of the weights does not have.
+
+    Args:
+        average: network that holds the average.
+        network: network that learns.
+        share: weight of its present weights.
+    """
+    for mean, now in zip(average.parameters(), network.parameters(), strict=True):
+        mean.lerp_(now, share)
+
+
 def torch_mirror(
     mirror: Mirror, device: torch.device | None = None
 ) -> Callable[[torch.Tensor], torch.Tensor]:

@@ -66,7 +66,7 @@ def train_student(config: DaggerConfig, source: Path | None, teacher: Path, fold
     spent = loop.train(run, config.budget, checkpoint)
     if process_group.rank() == 0:
         about = training_record("dagger", source, config, checkpoint)
-        export_policy(run.student, run.env, config.grid.answered, folder / POLICY_FILE, about)
+        export_policy(run.average, run.env, config.grid.answered, folder / POLICY_FILE, about)
     return spent
 
 
