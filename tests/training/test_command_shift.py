@@ -46,6 +46,17 @@ def test_the_shift_changes_after_some_sequences_and_is_bounded() -> None:
     assert largest[3] == 0.0
 
 
+def test_a_shift_at_its_bound_returns_as_soon_as_the_error_changes_its_sign() -> None:
+    shift, command = CommandShift(every=1), commands(500)
+    pushed = 0.1 * np.sign(command[:, :3])
+    for _ in range(60):
+        shift.add(command, pushed)
+    at_bound = np.median(np.abs(shift.of(command)[:, 0]))
+    for _ in range(3):
+        shift.add(command, -pushed)
+    assert np.median(np.abs(shift.of(command)[:, 0])) < 0.8 * at_bound
+
+
 def test_the_shift_is_symmetric_and_zero_in_stance() -> None:
     shift, command = CommandShift(every=1), commands(500)
     shift.add(command, np.abs(command[:, :3]) ** 1.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import attrs
 import numpy as np
 import onnx
 import pytest
@@ -148,7 +149,7 @@ def test_a_robot_that_fell_teaches_nothing_until_it_starts_over(run):
     assert (mask[1:, 3] == 0.0).all()
     memory = [part.clone() for part in run._memory]
     run._start_over(np.flatnonzero(mask[-1].numpy() == 0.0))
-    assert (run._memory[0][0, 3] == 0.0).all()
+    assert (run._memory[0][0, [3, 3 + SMALL.n]] == 0.0).all()  # that of its mirror image, too
     assert torch.equal(run._memory[0][0, 0], memory[0][0, 0])
     assert not run.env.fallen[3]
 
@@ -170,6 +171,52 @@ def test_the_student_learns_mirror_images_of_robots_that_do_not_stand(run):
     assert (
         run._memory[0].isclose(end[0], atol=1e-5).all()
     )  # that of the mirror images saw what they learn from
+
+
+def test_half_of_what_is_learned_are_mirror_images(teacher_file, monkeypatch):
+    def learned(chosen: int, swapped: bool) -> torch.Tensor:
+        run = DaggerRun(SMALL, teacher_file)
+        start = run._memory
+        experience, standing, _ = run.collect()
+        both = experience.with_mirror_images(0.0 * standing)
+        if swapped:
+            turn = torch.arange(2 * SMALL.n).roll(SMALL.n)
+            both = dagger.Experience(*(x[:, turn] for x in (both.obs, both.label, both.past, both.mask)))
+            start = (start[0][:, turn], start[1][:, turn])
+        monkeypatch.setattr(torch, "randint", lambda low, high, size: torch.full(size, chosen))
+        run.learn(both, start)
+        return torch.nn.utils.parameters_to_vector(run.student.parameters())
+
+    assert learned(1, swapped=False).equal(learned(0, swapped=True))
+    assert not learned(1, swapped=False).equal(learned(0, swapped=False))
+
+
+def test_robots_that_have_not_lifted_a_foot_count_as_standing(run):
+    *_, standing, _ = run.collect()
+    assert (standing == 1.0).all()
+    run.teacher.past.air[5, 2] = 0.2
+    run.env.contact[5, 2] = False
+    *_, standing, _ = run.collect()
+    assert (standing[:, 5] == 0.0).all()
+    assert (standing[:, 4] == 1.0).all()
+    run._start_over(np.array([5]))
+    *_, standing, _ = run.collect()
+    assert (standing[:, 5] == 1.0).all()
+
+
+def test_labels_are_smoothed(run, monkeypatch):
+    monkeypatch.setattr(dagger, "smooth_labels", lambda actions, mask: 0.0 * actions + 7.0)
+    experience, *_ = run.collect()
+    assert (experience.label == 7.0).all()
+
+
+def test_the_student_learns_the_commands_that_are_taught(teacher_file):
+    taught = VelocityCommandLimits((-0.3, -0.2, -0.5), (0.4, 0.2, 0.5), 4.0)
+    run = DaggerRun(attrs.evolve(SMALL, taught=taught), teacher_file)
+    drawn = run.grid.draw(np.random.default_rng(0), 500)[:, :3]
+    assert drawn.min(axis=0) == pytest.approx(taught.low, abs=0.1)
+    assert (drawn >= np.array(taught.low) - 1e-9).all()
+    assert (drawn <= np.array(taught.high) + 1e-9).all()
 
 
 def test_the_file_holds_the_mean_of_the_last_weights(run):
@@ -209,3 +256,16 @@ def test_commands_are_shifted_by_steady_errors_of_the_student_on_level_ground_al
     assert np.flatnonzero(run._steady(command)).tolist() == [0]
     run.teacher.past._age[0] = 0.5  # the plan has just reached the command
     assert not run._steady(command).any()
+
+
+def test_commands_are_shifted_by_the_mean_error_since_the_last_command(run, monkeypatch):
+    """Robots are at rest: the error is the command."""
+    added = []
+    monkeypatch.setattr(dagger, "SHORTEST_STEADY_S", 3.5 * dagger.TICK_S)
+    monkeypatch.setattr(run, "_steady", lambda command: np.arange(8) < 3)
+    monkeypatch.setattr(run.teacher.shift, "add", lambda command, error: added.append((command, error)))
+    run.env.command[:] = [0.8, 0.0, 0.0, 0.0]
+    run.collect()
+    ((command, error),) = added
+    assert command.shape == (3, 4)
+    assert error[:, 0] == pytest.approx(command[:, 0], abs=0.3)

@@ -15,7 +15,7 @@ from typing import Any
 from quadvel_description.network_file import metadata_texts, read_network
 from quadvel_description.recurrent_network import METADATA_KEY
 from quadvel_description.robot import load_robot
-from quadvel_description.robot_name import UNNAMED_ROBOT
+from quadvel_description.robot_name import UNNAMED_ROBOT, shipped_robots
 from quadvel_estimator.features import KIND
 from quadvel_eval.compare import comparison_figures, read_evaluation
 
@@ -71,8 +71,9 @@ ESTIMATOR = "A recurrent estimator of the {robot}'s linear velocity from IMU, en
 
 
 def _title(metadata: Json) -> str:
-    """Return the title of the robot that a file belongs to."""
-    return load_robot(metadata.get("robot", UNNAMED_ROBOT)).title
+    """Return the title of the robot that a file belongs to; that of a user's robot is its name."""
+    name: str = metadata.get("robot", UNNAMED_ROBOT)
+    return load_robot(name).title if name in shipped_robots() else name
 
 
 def _metadata(network: Path) -> dict[str, Any]:

@@ -5,13 +5,14 @@ a second, learns them in part: without this shift it was 0.1 m/s slow at 1.5 m/s
 asked for a shifted command. The shift grows by the student's own mean error at each command, as
 in integral control, until there is none. It is a smooth function of the command:
 
-    shift(c) = W phi(c),   W <- W + gain argmin_V sum_i w_i |e_i - V phi(c_i)|^2 + ridge |V|^2
+    shift(c) = W phi(c),   W <- W + gain argmin_V (sum_i w_i |e_i - V phi(c_i)|^2 + ridge |V|^2)
 
 where e_i is the command minus the velocity of a robot that the student drives, without exploration:
 a robot that explores is slower. phi are piecewise linear functions of vx, vy and yaw rate and the
-products of these up to the third degree. Errors are bounded, so that few robots that
-slip or carry much do not shift all others. All processes of a run share the shift. Weights w_i fall
-with the command: at the fastest ones robots fall before they are steady. The mirrored command gets the mirrored shift.
+products of vx, vy and yaw rate up to the third degree. Errors are bounded, so that few robots that
+slip or carry much do not shift all others; so is the shift, and an error that would take it past its
+bound does not count. All processes of a run share the shift. Weights w_i fall with the command: at the
+fastest ones robots fall before they are steady. The mirrored command gets the mirrored shift.
 """
 
 from __future__ import annotations
@@ -87,7 +88,8 @@ class CommandShift:
             error: (n, 3), command minus velocity in vx, vy (m/s) and yaw rate (rad/s).
         """
         weight = 1.0 / (1.0 + np.sum((command[:, :3] / SCALES) ** 2, axis=1, keepdims=True))
-        bounded = np.clip(error, -MAX_ERROR, MAX_ERROR)
+        shift = _features(command) @ self._weights
+        bounded = np.clip(shift + np.clip(error, -MAX_ERROR, MAX_ERROR), -MAX_SHIFT, MAX_SHIFT) - shift
         for sign in (np.ones(3), MIRROR):
             phi = _features(command[:, :3] * sign)
             self._squares += phi.T @ (weight * phi)
@@ -95,7 +97,8 @@ class CommandShift:
         self._calls += 1
         if self._calls == self.every:  # in all processes at the same time
             squares, products = (
-                process_group.mean(torch.from_numpy(sums)).numpy() for sums in (self._squares, self._products)
+                process_group.size() * process_group.mean(torch.from_numpy(sums)).numpy()
+                for sums in (self._squares, self._products)
             )
             self._weights += GAIN * np.linalg.solve(squares + RIDGE * np.eye(FEATURES), products)
             self._start_over()

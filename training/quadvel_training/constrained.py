@@ -20,7 +20,7 @@ import torch
 from quadvel_description import symmetry
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
-from quadvel_policy.observation import OBSERVATION_SIZE
+from quadvel_policy.observation import OBSERVATION_SIZE, VelocityCommandLimits
 from quadvel_sim.terrain import Terrain
 
 from . import dagger, privileged, process_group
@@ -74,6 +74,7 @@ class ConstrainedConfig:
         timestep: s, of the physics.
         seed: seed of all draws.
         grid: commands; has to match the grid of the student, whose open cells are taken over.
+        taught: limits of the commands that are learned, m/s, rad/s, m/s^2; None for all open cells.
         terrain: ground.
         randomisation: what varies between robots.
         rewards: weights of Table 2.
@@ -102,6 +103,7 @@ class ConstrainedConfig:
     timestep: float = 0.0025
     seed: int = 3
     grid: GridConfig = GridConfig()
+    taught: VelocityCommandLimits | None = None
     terrain: Terrain = Terrain()
     randomisation: Randomisation = Randomisation()
     rewards: RewardWeights = RewardWeights()
@@ -134,6 +136,8 @@ class ConstrainedRun:
         self.grid = CommandGrid(c.grid)
         if "grid" in known:
             self.grid.restore(known["grid"])
+        if c.taught:
+            self.grid.narrow(c.taught)
         robot = load_robot(c.robot)
         env_config = EnvConfig(
             robot=robot,

@@ -88,7 +88,7 @@ class DaggerConfig:
         budget: when the run ends.
         n: number of robots, of all processes together.
         threads: threads of the physics.
-        length: ticks per sequence; 256 are 1.28 s.
+        length: ticks per sequence; 256 are 1.28 s, and more than 100 shift commands.
         epochs: passes over each sequence.
         mini_batches: optimiser steps per pass.
         learning_rate: learning rate of Adam at the start.
@@ -302,6 +302,7 @@ class DaggerRun:
         self._memory: State = self.student.initial_state(2 * c.n)  # of robots, and of their mirror images
         self._previous = np.zeros((c.n, 12), np.float32)
         self._noise = np.zeros((c.n, 12), np.float32)
+        self._setting_off = np.ones(c.n, bool)  # new robots that have not lifted a foot yet
         self._explores = np.arange(c.n) % QUIET > 0
         self._turn = np.random.default_rng(c.seed).permutation(c.n) / c.n  # order of takeover
         self.driven = self._turn < self._share()
@@ -355,6 +356,7 @@ class DaggerRun:
             return
         self.env.reset(ids)
         self.driven[ids] = self._turn[ids] < self._share()
+        self._setting_off[ids] = True
         # The student starts with FR and RL. Half of the teacher's robots start with the other pair,
         # so that the student takes its phase from the motion, and walks mirrored as well.
         other_pair = ~self.driven[ids] & (self.env.rng.random(len(ids)) < 0.5)
@@ -411,19 +413,23 @@ class DaggerRun:
             drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
             self._noise = decay * self._noise + drawn_std * drawn * self._explores[:, None]
             self._previous = np.where(self.driven[:, None], own, advice) + self._noise
-            seen = obs, self.teacher.latest, self.teacher.past_features(), alive.copy()
-            for values, value in zip(rows.values(), seen, strict=True):
+            row = obs, self.teacher.latest, self.teacher.past_features(), alive.copy()
+            for values, value in zip(rows.values(), row, strict=True):
                 values.append(value)
-            standing.append(self.teacher.past.standing)
+            past = self.teacher.past
+            self._setting_off &= ~(past.air > past.clock.shortest_swing).any(axis=1)
+            standing.append(past.standing | self._setting_off)
             command = env.command.copy()
             env.tick(self.map.targets(self._previous))
             self.teacher.advance(command, self._previous)
             steady = self._steady(command)
             steady_s += TICK_S * steady
             drift += TICK_S * steady[:, None] * velocity_error(env, command)
+            drift[env.changed], steady_s[env.changed] = 0.0, 0.0
             fell |= env.fallen & alive
             alive &= ~(env.fallen | env.timed_out)
-        counts = alive & self.teacher.past.settled & (steady_s > SHORTEST_STEADY_S)
+        seen = self._figures(alive, fell)  # with the shift that was in force
+        counts = alive & (steady_s > SHORTEST_STEADY_S)
         self.teacher.shift.add(env.command[counts], drift[counts] / steady_s[counts, None])
         rows["mask"][-1] = alive  # robots that end in the last tick count as ended, too
         self.samples += c.length * c.n * process_group.size()
@@ -431,7 +437,7 @@ class DaggerRun:
         arrays["label"] = smooth_labels(arrays["label"], arrays["mask"])
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         stood = torch.from_numpy(np.array(standing, dtype=np.float32))
-        return Experience(**tensors), stood, self._figures(alive, fell)
+        return Experience(**tensors), stood, seen
 
     def _steady(self, command: np.ndarray) -> np.ndarray:
         """Whether the errors of robots (n,) show what the student does at a command, and not what else happens.
