@@ -118,7 +118,7 @@ class GaitClock:
         error = (phase[:, None] + FOOT_PHASES + 0.5) % 1.0 - 0.5
         phase = (phase - CORRECTION * (error * stepped).sum(axis=1)) % 1.0
         self.phase = np.where(self.walking, phase, self.first)
-        slow, pushed = REST_SPEED * self.size.time, PUSHED_SPEED * self.size.time
+        slow, pushed = REST_SPEED * self.size.speed, PUSHED_SPEED * self.size.speed
         at_rest = (speed < slow) & ~self.velocity.any(axis=1) & (self.swing_share() < 0.0).all(axis=1)
         self.walking = np.where(self.walking, ~at_rest, speed > pushed) | (command[:, 3] < 0.5)
 

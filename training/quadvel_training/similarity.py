@@ -4,8 +4,8 @@ Robots of different size move alike if lengths grow with their height h, times w
 speeds with sqrt(g h); the Froude number v^2 / (g h) is then the same. Source: Alexander and Jayes,
 A dynamic similarity hypothesis for the gaits of quadrupedal mammals (1983).
 
-So gait and rewards hold their numbers once, for a robot whose hips are `REFERENCE_HEIGHT_M` above
-its feet, and robots of another size use the same ones.
+So the script, its clock and the heights in the rewards hold their numbers once, for a robot whose hips
+are `REFERENCE_HEIGHT_M` above its feet. What the teacher observes does not scale.
 """
 
 from __future__ import annotations
@@ -44,8 +44,13 @@ class Size:
 
     @property
     def time(self) -> float:
-        """Ratio of the times; also that of the speeds, as both grow with the root of the length."""
+        """Ratio of the times."""
         return float(np.sqrt(self.length))
+
+    @property
+    def speed(self) -> float:
+        """Ratio of the speeds: that of the lengths over that of the times."""
+        return self.length / self.time
 
     def as_reference(self, velocity: np.ndarray) -> np.ndarray:
         """Return the velocity at which a reference robot moves alike.
@@ -56,8 +61,7 @@ class Size:
         Returns:
             (..., 3), the same.
         """
-        # v_reference = v / sqrt(length), w_reference = w sqrt(length)
-        return velocity * np.array([1.0 / self.time, 1.0 / self.time, self.time])
+        return velocity * np.array([1.0 / self.speed, 1.0 / self.speed, self.time])
 
 
 REFERENCE = Size()

@@ -166,7 +166,7 @@ def walk(
         env.tick(env.stand_q + ACTION_SCALE * action)
         past.advance(command)
         fell |= env.fallen
-        velocity.append(np.concatenate([env.velocity[:, :2], env.angular_velocity[:, 2:]], axis=1))
+        velocity.append(env.planar_velocity)
         contact.append(env.contact.copy())
         fastest.append((env.fastest / robot.velocity_limit).max(axis=1))
     last = slice(-round(MEASURED_S / SAMPLE_S), None)
