@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import attrs
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from quadvel_training.gait_clock import START_PHASE, GaitClock, duty_factor, ste
 from quadvel_training.past import Past  # noqa: E402
 from quadvel_training.privileged import ACTION_SCALE, total_action  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
+from quadvel_training.scripted_trot import joint_offsets  # noqa: E402
 from quadvel_training.similarity import Size  # noqa: E402
 from tests.helpers.robots import ALIENGO, GO2  # noqa: E402
 
@@ -183,3 +186,24 @@ def test_a_walk_that_starts_with_the_other_pair_is_half_a_cycle_apart() -> None:
     for _ in range(20):
         clock.advance(command, np.zeros(2), none, 0.02)
         np.testing.assert_allclose(clock.foot_phases()[1], clock.foot_phases()[0][[1, 0, 3, 2]])
+
+
+@pytest.mark.parametrize("vx", [0.5, 2.0, -1.5])
+def test_the_targets_of_the_script_do_not_jump_over_a_cycle(vx):
+    """The policy learns from them: a jump would be jitter of its joint targets."""
+    n = 2000
+    env = SimpleNamespace(
+        robot=ALIENGO,
+        size=Size(),
+        roll_pitch=np.tile([0.05, -0.03], (n, 1)),
+        angular_velocity=np.zeros((n, 3)),
+        planar_velocity=np.tile([vx, 0.1, 0.3], (n, 1)),
+        height=np.full(n, 0.39),
+        stand_q=ALIENGO.nominal_q + np.tile([0.0, 0.05, 0.3], 4),  # targets that hold its weight
+    )
+    clock = GaitClock(n)
+    clock.velocity[:], clock.walking[:] = [vx, 0.1, 0.3], True
+    clock.phase = np.linspace(0.0, 1.0, n, endpoint=False)
+    targets = joint_offsets(env, clock, np.zeros((n, 2)))
+    steps = np.abs(np.diff(targets, axis=0, append=targets[:1]))  # rad in 1/2000 of a cycle
+    assert steps.max() < 0.02

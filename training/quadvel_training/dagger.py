@@ -74,7 +74,7 @@ SHORTEST_STEADY_S = 0.5  # of a sequence in which a robot is steady, for its mea
 QUIET = 2  # every second robot does not explore
 AVERAGED_TICKS = 3
 """Ticks over which a teacher that drives averages its actions: held actions act late by as much"""
-LABEL_BEFORE, LABEL_AFTER = 5, 3
+LABEL_BEFORE, LABEL_AFTER = 3, 1
 """Ticks before and after its own that a label averages: as late as `AVERAGED_TICKS`, and without jumps"""
 SHIFT_SEQUENCES = 8  # from one change of the shifted commands to the next: a million samples of 512 robots
 

@@ -166,8 +166,9 @@ class GaitClock:
         A mirrored robot has the clock half a cycle later: sine and cosine change sign.
 
         Returns:
-            (n, 5): sine and cosine of the phase, 0 while standing; planned velocity.
+            (n, 5): sine and cosine of the phase, 0 while standing; planned velocity of a robot of
+            the reference size that moves alike.
         """
         angle = 2.0 * np.pi * self.phase
         phase = np.stack([np.sin(angle), np.cos(angle)], axis=1) * self.walking[:, None]
-        return np.concatenate([phase, self.velocity], axis=1)
+        return np.concatenate([phase, self.size.as_reference(self.velocity)], axis=1)

@@ -76,7 +76,8 @@ def observe_state(
 ) -> np.ndarray:
     """Observations of the true state, for the critics of all stages.
 
-    They are the paper's 48 numbers, feet, height, past errors, ground and plant.
+    They are the paper's 48 numbers, feet, height, past errors, ground and plant. Lengths, times and
+    speeds are those of a robot of the reference size that moves alike.
 
     Args:
         env: environments.
@@ -87,20 +88,22 @@ def observe_state(
     Returns:
         (n, STATE_SIZE), scaled to about 1.
     """
+    size, command = env.size, env.command if command is None else command
     return np.concatenate(
         [
-            env.command if command is None else command,
+            size.as_reference(command[:, :3]),
+            command[:, 3:],
             2 * env.roll_pitch,
             2 * (env.q - env.robot.nominal_q),
-            0.1 * env.dq,
-            env.velocity,
-            0.5 * env.angular_velocity,
+            0.1 * size.time * env.dq,
+            env.velocity / size.speed,
+            0.5 * size.time * env.angular_velocity,
             previous,
             env.contact,
-            np.clip(5 * env.clearance, -1, 2),
-            5 * (env.height[:, None] - WALKING_HEIGHT_M * env.size.length),
-            2 * past.stride,
-            2 * past.lasting,
+            np.clip(5 * env.clearance / size.length, -1, 2),
+            5 * (env.height[:, None] / size.length - WALKING_HEIGHT_M),
+            2 * size.as_reference(past.stride),
+            2 * size.as_reference(past.lasting),
             3 * env.ground_slope,
             env.plants.drawn[:, :4],
             0.2 * env.plants.drawn[:, 4:5],

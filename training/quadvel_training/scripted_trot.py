@@ -38,6 +38,7 @@ RATE_S = np.array([0.025, 0.08])  # time that a roll or pitch rate is extrapolat
 HEIGHT_GAIN = 0.54  # share of the height above HEIGHT_M by which stance feet of a walk give way,
 MAX_HEIGHT_ERROR_M = 0.1  # up to this error
 LOAD = 1.7  # share of the load of a stance foot that is fed forward
+LOADING = 0.08  # cycles in which a stance takes and leaves its load, half of them before it starts and ends
 
 
 def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.ndarray:
@@ -60,6 +61,7 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.nda
     phases = clock.foot_phases(ahead)
     share = np.where(clock.walking[:, None], clock.swing_share(ahead), -1.0)
     swing, down = np.maximum(share, 0.0), share < 0.0  # s: share of the planned swing that is over
+    loaded = np.where(clock.walking[:, None], _load(phases, duty), 1.0)
     excess = np.clip(velocity[:, :2] - planned[:, :2], -MAX_EXCESS, MAX_EXCESS)
     turning = np.clip(velocity[:, 2] - planned[:, 2], -MAX_YAW_EXCESS, MAX_YAW_EXCESS)
     # way of a foot at (x, y) in a stance of duty / f: (vx - w y, vy + w x) duty / f,
@@ -92,11 +94,21 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.nda
     above = (
         np.clip(env.height / size.length - HEIGHT_M, -MAX_HEIGHT_ERROR_M, MAX_HEIGHT_ERROR_M) * clock.walking
     )
-    feet[..., 2] += LIFT_M * np.sin(np.pi * swing) ** 2 + (level + HEIGHT_GAIN * above[:, None]) * down
+    feet[..., 2] += LIFT_M * np.sin(np.pi * swing) ** 2 + (level + HEIGHT_GAIN * above[:, None]) * loaded
     # a planned stance carries 4 / (number of planned stances) of its load on four feet
-    carried = down * 4.0 / np.maximum(down.sum(axis=1, keepdims=True), 1) - 1.0
+    carried = loaded * 4.0 / np.maximum(loaded.sum(axis=1, keepdims=True), 1.0) - 1.0
     load = LOAD * np.repeat(carried, 3, axis=1) * (env.stand_q - robot.nominal_q)
     return np.asarray(inverse_kinematics(robot, size.length * feet) - robot.nominal_q + load)
+
+
+def _load(phases: np.ndarray, duty: np.ndarray) -> np.ndarray:
+    """Share (n, 4) of its load that a foot carries, without jumps.
+
+    It grows linearly over `LOADING` cycles around touchdown, at phase 0, and falls around lift-off.
+    """
+    left = duty[:, None] - phases
+    inside = np.where(left > 0.0, np.minimum(phases, left), -np.minimum(-left, 1.0 - phases))  # cycles
+    return np.asarray(np.clip(0.5 + inside / LOADING, 0.0, 1.0))
 
 
 def _turned(feet: np.ndarray, angle: np.ndarray) -> np.ndarray:
