@@ -15,6 +15,7 @@ quadvel_dds.install()
 
 import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
 
 from quadvel_bringup import cli  # noqa: E402
 from quadvel_bringup.recorder import Recorder  # noqa: E402
@@ -24,6 +25,7 @@ from quadvel_driver.calibration import Calibration  # noqa: E402
 from quadvel_driver.find_calibration import CalibrationFit  # noqa: E402
 from quadvel_msgs.msg import LowState  # noqa: E402
 from quadvel_nodes.messages import write_low_state  # noqa: E402
+from quadvel_nodes.robot_view import LATCHED  # noqa: E402
 from quadvel_sim.simulator import Simulator, SimulatorConfig  # noqa: E402
 from tests.helpers.robots import ALIENGO  # noqa: E402
 
@@ -38,11 +40,14 @@ def record_standing(path: Path, seconds: float) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     publisher = node.create_publisher(LowState, "low_state", 10)
+    describer = node.create_publisher(String, "robot_description", LATCHED)
+    describer.publish(String(data=(ALIENGO.folder / "robot.urdf").read_text()))
     simulator = Simulator(SimulatorConfig(robot=ALIENGO))
     simulator.reset("stand")
     hold = JointCommand(q=np.array(ALIENGO.nominal_q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
     with Recorder(node, RecordingFile(path)) as recorder:
         recorder.record("/low_state", "quadvel_msgs/msg/LowState")
+        recorder.record("/robot_description", "std_msgs/msg/String")
         for _ in range(round(200 * seconds)):
             simulator.command(hold)
             simulator.step(5)
@@ -88,6 +93,7 @@ def test_what_tells_nothing_is_refused_in_one_sentence_and_writes_nothing(
     for arguments, sentence in (
         ((), "name one with --suspended, with --standing, or both"),
         (("--standing", tmp_path / "none.mcap"), "there is no such file"),
+        (("--standing", standing, "--robot", "go2"), "robot is 'aliengo', expected 'go2'"),
         (("--suspended", standing), "hardly moves to and fro; record quadvel excite creep"),
     ):
         code, text = calibrate(*arguments, "--out", file)

@@ -8,6 +8,7 @@ from collections import deque
 from io import StringIO
 from typing import Any
 
+import pytest
 from rich.console import Console
 
 import quadvel_dds
@@ -17,7 +18,7 @@ quadvel_dds.install()
 from geometry_msgs.msg import TwistWithCovarianceStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 
-from quadvel_bringup.status import STATUS_TOPICS, NodeReport, _equipment, _lines, running_nodes  # noqa: E402
+from quadvel_bringup.status import STATUS_TOPICS, NodeReport, _equipment, _lines, running_nodes, status  # noqa: E402
 from quadvel_lab.demo import _report  # noqa: E402
 from quadvel_msgs.msg import ControllerState  # noqa: E402
 
@@ -58,6 +59,24 @@ def test_nodes_of_the_control_loop_that_are_found_seconds_after_the_first_are_wa
         nodes = running_nodes()
         robot.stdin.close()
     assert list(nodes) == ["command_mux", "controller", "estimator", "sim_node"]
+
+
+def test_a_second_robot_on_the_domain_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    two = """
+from quadvel_msgs.msg import LowState
+states = [node.create_publisher(LowState, "low_state", 10) for _ in range(2)]
+print("ready", flush=True)
+"""
+    program = ROBOT.replace('print("ready", flush=True)\n', two).replace("3.5", "0.2")
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as robot:
+        assert robot.stdin is not None
+        assert robot.stdout is not None
+        robot.stdout.readline()
+        assert status() == 1
+        robot.stdin.close()
+    assert "low_state has 2 publishers, expected 1" in capsys.readouterr().out
 
 
 def test_status_of_a_robot_that_has_not_ticked_yet_shows_dashes() -> None:

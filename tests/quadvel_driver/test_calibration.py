@@ -15,6 +15,7 @@ from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver.calibration import Calibration, CalibrationError
 from quadvel_driver.find_calibration import CalibrationDataError, CalibrationFit, Samples, fit_calibration
 from quadvel_driver.leg_dynamics import leg_torque
+from quadvel_driver.parameters import DriverParameters
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.simulator import Simulator
 from quadvel_sysid.excitation import Creep
@@ -190,6 +191,16 @@ def test_the_file_is_read_as_it_was_written(tmp_path: Path) -> None:
     read = Calibration.load(file)
     np.testing.assert_allclose(read.joint_zeros, OFF.joint_zeros, atol=1e-5)
     np.testing.assert_allclose(read.imu_mounting, OFF.imu_mounting, atol=1e-5)
+
+
+def test_a_driver_refuses_the_calibration_of_another_robot(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    file.write_text(attrs.evolve(OFF, robot="go2").to_yaml())
+    assert DriverParameters(robot="go2", calibration=str(file)).load_calibration().robot == "go2"
+    with pytest.raises(CalibrationError, match="robot is 'go2', expected 'aliengo'"):
+        DriverParameters(calibration=str(file)).load_calibration()
+    file.write_text(OFF.to_yaml().replace("robot: aliengo\n", ""))  # older than the names
+    assert DriverParameters(calibration=str(file)).load_calibration().robot == "aliengo"
 
 
 @pytest.mark.parametrize(

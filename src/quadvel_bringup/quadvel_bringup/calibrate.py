@@ -9,14 +9,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
+import attrs
 import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
 
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import load_robot
-from quadvel_description.robot_name import DEFAULT_ROBOT
+from quadvel_description.robot import Robot, robot_of_file
+from quadvel_description.robot_name import described_robot
 from quadvel_description.state import RobotState
 from quadvel_driver.find_calibration import (
     CalibrationDataError,
@@ -26,7 +27,7 @@ from quadvel_driver.find_calibration import (
 )
 from quadvel_nodes.messages import read_low_state
 from quadvel_recordings.output import atomic_write, output_file
-from quadvel_recordings.reading import read_messages
+from quadvel_recordings.reading import read_messages, recorded_description
 
 TOPIC = "/low_state"
 START_TRIM_S = 2.0
@@ -55,8 +56,12 @@ def calibrate_command(
         ),
     ] = None,
     robot: Annotated[
-        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or the folder of a robot.")
-    ] = DEFAULT_ROBOT,
+        str | None,
+        typer.Option(
+            metavar="<name|file>",
+            help="The robot: aliengo, go2 or the folder of a robot. Default: that of the recording.",
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(metavar="<file>", help="The file to write.")] = Path(
         "out/calibration.yaml"
     ),
@@ -75,10 +80,10 @@ def calibrate_command(
       quadvel calibrate --suspended suspended.mcap --standing standing.mcap --out calibration.yaml
       quadvel run driver --ros-args -p calibration:=calibration.yaml
     """
-    chosen = load_robot(robot)
     if suspended is None and standing is None:
         raise ValueError("no recording given: name one with --suspended, with --standing, or both")
     output_file(out)
+    chosen = _robot([path for path in (suspended, standing) if path], robot)
     found = fit_calibration(chosen, _samples(suspended), _samples(standing))
     console = Console(soft_wrap=True)
     console.print(_table(found))
@@ -90,8 +95,18 @@ def calibrate_command(
             f"[yellow]the standing feet are {uneven} off a common plane: check the floor and the joints"
         )
     with atomic_write(out) as draft:
-        draft.write_text(found.calibration.to_yaml())
+        draft.write_text(attrs.evolve(found.calibration, robot=chosen.name).to_yaml())
     console.print(f"written to {out}", highlight=False)
+
+
+def _robot(paths: list[Path], asked: str | None) -> Robot:
+    """Return the robot of the recordings; ValueError if they, or `asked`, are of different ones."""
+    robot = robot_of_file(paths[0], described_robot(recorded_description(paths[0])), asked)
+    for path in paths[1:]:
+        named = described_robot(recorded_description(path))
+        if named not in (None, robot.name):
+            raise ValueError(f"{path}: robot is {named!r}, expected {robot.name!r}")
+    return robot
 
 
 def _samples(path: Path | None) -> Samples | None:
@@ -101,7 +116,8 @@ def _samples(path: Path | None) -> Samples | None:
     try:
         return Samples.from_states(_trimmed(list(_states(path))))
     except CalibrationDataError as error:
-        raise ValueError(f"{path}: {error}") from None
+        ends = f"without its first {START_TRIM_S:g} s and its last {END_TRIM_S:g} s"
+        raise ValueError(f"{path}, {ends}: {error}") from None
 
 
 def _states(path: Path) -> Iterator[RobotState]:

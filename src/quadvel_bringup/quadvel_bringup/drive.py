@@ -19,7 +19,7 @@ from quadvel_description.arrays import Array
 from quadvel_msgs.msg import ControllerState, VelocityCommand
 from quadvel_nodes.number_text import number_text
 
-from .operator_commands import MODE_TIMEOUT_S, RECOVERY_HINT, START_HINT
+from .operator_commands import MODE_TIMEOUT_S, NO_STATES, RECOVERY_HINT, START_HINT
 from .processes import StopSignals
 from .session import DISCOVERY_TIMEOUT_S, Session, not_running
 
@@ -93,9 +93,7 @@ class DriveRun:
         if state.mode_name == "fault":
             return f"the robot is in fault: {state.reason}\nonce the cause is gone: {RECOVERY_HINT}"
         if not state.rate_hz:  # over the last second
-            return (
-                "the controller receives no states: is the simulator paused? Does the driver reach its robot?"
-            )
+            return NO_STATES
         return str(state.walk_refusal)
 
     def send(self) -> None:

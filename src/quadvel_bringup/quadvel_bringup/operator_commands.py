@@ -24,6 +24,8 @@ SIMULATOR_NODES = tuple(dict.fromkeys(level.simulation for level in LOW_LEVELS.v
 """Nodes that can simulate the robot; they offer the same services."""
 RECOVERY_HINT = "quadvel mode passive, then quadvel mode stand_up"
 """Advice after a fault."""
+NO_STATES = "the controller receives no states: is the simulator paused? Does the driver reach its robot?"
+"""Likely causes if a robot does not follow."""
 TRANSIENT_MODES = {"stand_up": "stance", "lie_down": "passive"}
 """Modes that end by themselves, and their successors."""
 MODE_TIMEOUT_S = 10.0
@@ -61,6 +63,8 @@ def mode(wanted: str) -> int:
             raise NotRunningError(f"controller/state: no message for {MODE_TIMEOUT_S:g} s")
         state = states[-1]
         print(f"{state.mode_name}: {state.reason} ({time.monotonic() - asked:.1f} s)")
+        if state.mode_name == wanted and not state.rate_hz:
+            print(NO_STATES)
         return 0 if state.mode_name == TRANSIENT_MODES[wanted] else 1
 
 

@@ -46,9 +46,10 @@ def not_running(node: Any, text: str) -> NotRunningError:
         text: What is missing.
 
     Returns:
-        The error; it lists type conflicts and other ROS domains.
+        The error; it lists type conflicts first, and without one other ROS domains.
     """
-    return NotRunningError("; ".join([text, *map(str, all_conflicts(node)), discovery_hint()]))
+    conflicts = [str(conflict) for conflict in all_conflicts(node)]
+    return NotRunningError("; ".join([*conflicts, text] if conflicts else [text, discovery_hint()]))
 
 
 class Session:

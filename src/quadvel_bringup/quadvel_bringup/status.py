@@ -79,7 +79,12 @@ def status(joints: bool = False) -> int:
     with Session("status") as session:
         heard = {topic: session.listen(kind, topic, keep=1000) for topic, kind in STATUS_TOPICS.items()}
         _wait_for_reports(session, heard["/diagnostics"])
-        conflicts = all_conflicts(session.node)
+        conflicts = [f"[yellow]warning[/] {conflict}" for conflict in all_conflicts(session.node)]
+        robots = session.node.count_publishers("low_state")
+        if robots > 1:
+            conflicts.append(
+                f"[red]error[/] low_state has {robots} publishers, expected 1: end all robots but one"
+            )
     nodes = nodes_from_diagnostics(heard["/diagnostics"])
     if not nodes:
         print(f"no robot runs; start one: quadvel up; {discovery_hint()}")
@@ -87,7 +92,7 @@ def status(joints: bool = False) -> int:
     console = Console(soft_wrap=True, highlight=False)
     for name, text in [
         *_nodes(nodes),
-        *(("topic", f"[yellow]warning[/] {conflict}") for conflict in conflicts),
+        *(("topic", conflict) for conflict in conflicts),
         *_lines(heard),
         *_equipment(nodes),
         *(_measurements(heard["low_state"]) if joints else ()),
@@ -95,7 +100,7 @@ def status(joints: bool = False) -> int:
         console.print(f"{name:13} {text}")
     states = heard["controller/state"]
     failed = any(node.level == DiagnosticStatus.ERROR for node in nodes.values())
-    return 1 if failed or not states or states[-1].mode_name == "fault" else 0
+    return 1 if failed or robots > 1 or not states or states[-1].mode_name == "fault" else 0
 
 
 def running_nodes() -> dict[str, NodeReport]:

@@ -18,6 +18,7 @@ from quadvel_description.arrays import Array
 from quadvel_description.bounded_yaml import read_yaml
 from quadvel_description.kinematics import rotation_matrix
 from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_description.robot_name import UNNAMED_ROBOT
 from quadvel_description.state import JointCommand, RobotState
 
 SCHEMA = 1
@@ -36,6 +37,7 @@ class Calibration:
         joint_zeros: Encoder readings at the joints' zero angles, (12,), rad.
         imu_mounting: Tilt of the IMU against the trunk, (2,), rad: roll (about x) and pitch (about
             y).
+        robot: Name of the robot.
 
     Raises:
         CalibrationError: An offset is not finite, too large, or of the wrong shape; raised by the
@@ -44,6 +46,7 @@ class Calibration:
 
     joint_zeros: Array = attrs.field(factory=lambda: np.zeros(12))
     imu_mounting: Array = attrs.field(factory=lambda: np.zeros(2))
+    robot: str = UNNAMED_ROBOT
 
     def __attrs_post_init__(self) -> None:
         for field, size in (("joint_zeros", 12), ("imu_mounting", 2)):
@@ -81,7 +84,8 @@ class Calibration:
                 raise CalibrationError(
                     "joint_zeros or imu_mounting has other names than the twelve joints, roll and pitch"
                 )
-            return cls(_numbers(zeros, JOINT_NAMES), _numbers(mounting, ("roll", "pitch")))
+            robot = str(content.get("robot", UNNAMED_ROBOT))
+            return cls(_numbers(zeros, JOINT_NAMES), _numbers(mounting, ("roll", "pitch")), robot)
         except Exception as error:  # the content is arbitrary, and so is the error
             raise CalibrationError(
                 f"{path}: {type(error).__name__}: {' '.join(str(error).split())}"
@@ -97,7 +101,12 @@ class Calibration:
             name: round(zero, 5) for name, zero in zip(JOINT_NAMES, self.joint_zeros.tolist(), strict=True)
         }
         roll, pitch = self.imu_mounting.round(5).tolist()
-        content = {"schema": SCHEMA, "joint_zeros": zeros, "imu_mounting": {"roll": roll, "pitch": pitch}}
+        content = {
+            "schema": SCHEMA,
+            "robot": self.robot,
+            "joint_zeros": zeros,
+            "imu_mounting": {"roll": roll, "pitch": pitch},
+        }
         head = "# What encoders and IMU of one robot show at zero, rad; `quadvel calibrate` wrote it, the driver applies it.\n"
         return head + yaml.safe_dump(content, sort_keys=False)
 

@@ -29,6 +29,7 @@ from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.flat_messages import decode_low_cmd, encode_low_state
 from quadvel_nodes.messages import Refusals
 from quadvel_nodes.node import read_parameters, request_exit, run
+from quadvel_nodes.robot_check import RobotCheck
 from quadvel_nodes.robot_view import RobotView
 from quadvel_nodes.system_time import SystemTime
 
@@ -77,6 +78,7 @@ class Driver(Node):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if opened.dry_run:  # it may run next to a simulator, so it must not publish as a robot
             self.create_timer(1.0, partial(self._show, opened.dry_run), clock=steady)
+            self._robot_check = RobotCheck(self, self._robot)
         else:
             self._create_publishers()
             self.create_timer(OPERATOR_PERIOD_S, self._serve_operator, clock=steady)

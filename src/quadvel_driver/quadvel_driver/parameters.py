@@ -5,10 +5,11 @@ from __future__ import annotations
 import attrs
 
 from quadvel_description.fields import field
+from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_nodes.scheduling import Scheduling
 
-from .calibration import Calibration
+from .calibration import Calibration, CalibrationError
 from .link import NO_CALIBRATION
 from .remote import RemoteConfig
 from .udp import UdpConfig
@@ -46,6 +47,12 @@ class DriverParameters(UdpConfig, DdsConfig, RemoteConfig, Scheduling):
             The calibration; zero offsets if no file is set.
 
         Raises:
-            CalibrationError: The file is not a calibration.
+            CalibrationError: The file is not a calibration of this robot.
+            FileNotFoundError: There is no such robot.
         """
-        return Calibration.load(self.calibration) if self.calibration else NO_CALIBRATION
+        if not self.calibration:
+            return NO_CALIBRATION
+        found, robot = Calibration.load(self.calibration), load_robot(self.robot).name
+        if found.robot != robot:
+            raise CalibrationError(f"{self.calibration}: robot is {found.robot!r}, expected {robot!r}")
+        return found
