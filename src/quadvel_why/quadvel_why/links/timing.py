@@ -76,7 +76,8 @@ class Jitter(Cause):
     needs = ("modes",)
     remedy = (
         "Give the control loop a core and a real-time priority (`realtime_priority`, `cpus`); look for work in its "
-        "callbacks, with `loop` of `quadvel plot`"
+        "callbacks, with `loop` of `quadvel plot`. A simulated robot waits for its controller: on a busy machine "
+        "record it without real time, with `quadvel demo --lockstep`, and ask again"
     )
 
     @override
