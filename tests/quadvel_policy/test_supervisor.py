@@ -390,7 +390,7 @@ def test_passive_clears_a_fault_and_nothing_else_does(rig: Rig) -> None:
     rig.tick(age=1.0)
     accepted, message = rig.supervisor.request("stand_up")
     assert not accepted
-    assert message == "is in fault (the state is 1000 ms old, limit 50 ms), request passive first"
+    assert message == "the robot is in fault (the state is 1000 ms old, limit 50 ms), request passive first"
     assert rig.supervisor.request("passive")[0]
     rig.stand()
 

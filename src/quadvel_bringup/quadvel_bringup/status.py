@@ -90,14 +90,16 @@ def status(joints: bool = False) -> int:
         print(f"no robot runs; start one: quadvel up; {discovery_hint()}")
         return 1
     console = Console(soft_wrap=True, highlight=False)
-    for name, text in [
+    rows = [
         *_nodes(nodes),
         *(("topic", conflict) for conflict in conflicts),
         *_lines(heard),
         *_equipment(nodes),
         *(_measurements(heard["low_state"]) if joints else ()),
-    ]:
-        console.print(f"{name:13} {text}")
+    ]
+    width = max(13, *(len(name) for name, _ in rows))
+    for name, text in rows:
+        console.print(f"{name:{width}} {text}")
     states = heard["controller/state"]
     failed = any(node.level == DiagnosticStatus.ERROR for node in nodes.values())
     return 1 if failed or robots > 1 or not states or states[-1].mode_name == "fault" else 0

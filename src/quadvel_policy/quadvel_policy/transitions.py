@@ -268,7 +268,7 @@ def request_refusal(target: str, now: Situation) -> str:
         still_there = target == "stance" and now.latch.persists(now.findings)
         return f"what stopped the robot is still there: {now.latch.sentence}" if still_there else ""
     if now.mode == "fault":
-        return f"is in fault ({now.reason}), request passive first"
+        return f"the robot is in fault ({now.reason}), request passive first"
     if now.last is None:
         return "the robot has not reported yet"
     if (now.mode, target) not in REQUESTED:
