@@ -239,7 +239,10 @@ def check_damping(rig: Rig, case: Case, name: str) -> None:
     reason = rig.supervisor.reason
     rig.run(0.3, FORWARD)
     assert (rig.mode, rig.supervisor.reason) == ("fault", reason)
-    assert rig.supervisor.request("stand_up") == (False, f"the robot is in fault ({reason}), request passive first")
+    assert rig.supervisor.request("stand_up") == (
+        False,
+        f"the robot is in fault ({reason}), request passive first",
+    )
     rig.inputs.clear()
     assert rig.supervisor.request("passive")[0]
     rig.policy.action = np.zeros(12, np.float32)
