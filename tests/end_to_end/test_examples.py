@@ -89,14 +89,18 @@ NODES = [
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r low_cmd:=/test/low_cmd", served=True),
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel", served=True),
     Step("quadvel run driver --ros-args -p dry_run:=true", served=True),
-    Step("quadvel run driver --ros-args -p robot:=go2 -p dry_run:=true", served=True),
     Step("quadvel run person_tracker --ros-args -p laser_x:=0.25", served=True),
     Step("quadvel run follow_planner --ros-args -p laser_x:=0.25 -p side:=left", served=True),
     Step("quadvel run trajectory_planner --ros-args -p file:=eight -p closed_loop:=true", served=True),
     Step("quadvel doctor"),
     Step("quadvel doctor --report"),
 ]
-SESSIONS = {"robot": ROBOT, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
+GO2 = [
+    Step("quadvel up --robot go2 --policy none --estimator kalman", served=True, then="stance: stood up"),
+    Step("quadvel run driver --ros-args -p robot:=go2 -p dry_run:=true", served=True),
+]
+USUAL = ["robot", "logs", "nodes"]
+SESSIONS = {"go2": GO2, "robot": ROBOT, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
 
 LEFT_OUT = {
     "python -m benchmarks.identification.others walks FOLDER": "needs measured walks",
@@ -143,8 +147,6 @@ LEFT_OUT = {
     "quadvel up --low-level board": "a board waits for nobody; tests/end_to_end/test_board.py, on a machine with time to spare",
     "quadvel record low_state --seconds 5 --out standing.mcap": "as the other recordings",
     "quadvel up --low-level driver": "needs the robot",
-    "quadvel up --robot go2 --policy none --estimator kalman": "as with --terrain; tests/quadvel_bringup/"
-    "test_preflight.py checks this stack",
     "quadvel run driver --ros-args -p state_rate:=1000": "the same",
     "quadvel up --low-level board --params imu.yaml": "as the board without; test_yaml_examples.py loads the file",
     "quadvel run driver --ros-args -p calibration:=calibration.yaml": "the same",
@@ -291,7 +293,10 @@ def leg_log(seed: int, with_torque: bool) -> dict[str, np.ndarray]:
     return log
 
 
-@pytest.mark.parametrize("name", ["robot", "logs", "nodes", pytest.param("excite", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "name",
+    [*USUAL, *(pytest.param(one, marks=pytest.mark.long) for one in SESSIONS if one not in USUAL)],
+)
 def test_the_examples_run(name: str, sandbox: Path) -> None:
     said: list[str] = []
     with ProcessGroup(lambda process, line: said.append(line)) as group:

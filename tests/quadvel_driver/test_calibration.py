@@ -129,7 +129,7 @@ def test_an_imu_that_leans_by_two_degrees_is_found_from_standing_alone() -> None
     assert not found.calibration.joint_zeros.any()
 
 
-@pytest.mark.parametrize("has_stood", [True, False])
+@pytest.mark.parametrize("has_stood", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_robot_whose_sensors_are_right_is_not_corrected(has_stood: bool) -> None:
     found = fitted(Calibration(), has_stood=has_stood)
     assert not found.calibration.joint_zeros.any()

@@ -51,7 +51,8 @@ def one_sided(
 
 
 @pytest.mark.parametrize(
-    ("sign", "kp", "kd", "coulomb"), [(1.0, 60.0, 1.5, (0.4, 0.1)), (-1.0, 45.0, 1.1, (0.25, 0.15))]
+    ("sign", "kp", "kd", "coulomb"),
+    [(1.0, 60.0, 1.5, (0.4, 0.1)), pytest.param(-1.0, 45.0, 1.1, (0.25, 0.15), marks=pytest.mark.long)],
 )
 def test_an_offset_that_keeps_a_torque_from_changing_sign_is_named(sign, kp, kd, coulomb):
     report = identify([one_sided(sign, kp, kd, coulomb, seed=11)]).report

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import Robot, robot_of_file
+from quadvel_description.robot import Robot, load_robot, robot_of_file
 from quadvel_description.robot_name import described_robot
 from quadvel_description.state import RobotState
 from quadvel_driver.find_calibration import (
@@ -80,6 +80,8 @@ def calibrate_command(
       quadvel calibrate --suspended suspended.mcap --standing standing.mcap --out calibration.yaml
       quadvel run driver --ros-args -p calibration:=calibration.yaml
     """
+    if robot is not None:
+        load_robot(robot)  # wrong files are refused first
     if suspended is None and standing is None:
         raise ValueError("no recording given: name one with --suspended, with --standing, or both")
     output_file(out)
