@@ -137,6 +137,7 @@ def test_a_robot_whose_sensors_are_right_is_not_corrected(has_stood: bool) -> No
     assert np.abs(errors_in_standard_errors(found, Calibration())).max() < 3.0
 
 
+@pytest.mark.long
 def test_a_leaning_imu_is_not_taken_for_joints_that_are_off() -> None:
     found = fitted(LEANING)
     assert not found.calibration.joint_zeros.any()
@@ -151,6 +152,7 @@ def test_a_leaning_imu_of_a_suspended_robot_is_found_for_encoders_that_are_right
     assert found.calibration.imu_mounting[0] == found.tilt[0]
 
 
+@pytest.mark.long
 def test_an_offset_of_the_measured_torques_is_not_taken_for_joints_that_are_off() -> None:
     right = Samples.from_states(recorded(True, 60.0, Calibration()))
     found = fit_calibration(ALIENGO, attrs.evolve(right, tau=right.tau + 0.03), None)
