@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import StringIO
 from typing import Any
 
@@ -49,15 +51,22 @@ except rclpy.executors.ExternalShutdownException:
 """
 
 
-def test_nodes_of_the_control_loop_that_are_found_seconds_after_the_first_are_waited_for() -> None:
+@contextmanager
+def running(program: str) -> Iterator[None]:
+    """The program from its line "ready" on, until its input closes."""
     with subprocess.Popen(
-        [sys.executable, "-c", ROBOT], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as robot:
         assert robot.stdin is not None
         assert robot.stdout is not None
         robot.stdout.readline()
-        nodes = running_nodes()
+        yield
         robot.stdin.close()
+
+
+def test_nodes_of_the_control_loop_that_are_found_seconds_after_the_first_are_waited_for() -> None:
+    with running(ROBOT):
+        nodes = running_nodes()
     assert list(nodes) == ["command_mux", "controller", "estimator", "sim_node"]
 
 
@@ -68,14 +77,8 @@ states = [node.create_publisher(LowState, "low_state", 10) for _ in range(2)]
 print("ready", flush=True)
 """
     program = ROBOT.replace('print("ready", flush=True)\n', two).replace("3.5", "0.2")
-    with subprocess.Popen(
-        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as robot:
-        assert robot.stdin is not None
-        assert robot.stdout is not None
-        robot.stdout.readline()
+    with running(program):
         assert status() == 1
-        robot.stdin.close()
     assert "low_state has 2 publishers, expected 1" in capsys.readouterr().out
 
 

@@ -34,7 +34,6 @@ from torch import Tensor
 from quadvel_description import symmetry
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
-from quadvel_description.symmetry import Mirror
 from quadvel_policy.observation import (
     COMMAND_AXES,
     OBSERVATION_SIZE,
@@ -60,13 +59,17 @@ from .randomisation import Randomisation, load_actuator
 from .walking_rewards import SAMPLE_S, error_magnitudes
 
 HOLD_TICKS = round(SAMPLE_S / TICK_S)  # the teacher learned with actions held for so long
-PAST_SIGNS = np.array([1, -1, -1, 1, -1, -1, 1, -1, -1, -1, 1, -1, -1], float)
-PAST_SIZE = len(PAST_SIGNS)
-"""What the teacher observes of the past: errors over a stride, lasting ones, lag, phase, planned velocity"""
-MIRRORS = tuple(
-    torch_mirror(mirror)
-    for mirror in (symmetry.OBSERVATION, symmetry.JOINTS, Mirror(np.arange(PAST_SIZE), PAST_SIGNS))
+PAST_MIRROR = symmetry.concatenate_mirrors(
+    [
+        privileged.PLANAR,  # error over a stride
+        privileged.PLANAR,  # lasting error
+        symmetry.sign_mirror(1, -1),  # lag
+        symmetry.sign_mirror(-1, -1),  # phase of the steps
+        privileged.PLANAR,  # planned velocity
+    ]
 )
+PAST_SIZE = len(PAST_MIRROR.index)  # what the teacher observes of the past
+MIRRORS = tuple(torch_mirror(mirror) for mirror in (symmetry.OBSERVATION, symmetry.JOINTS, PAST_MIRROR))
 """Of observations, actions, and what the teacher observes of the past"""
 LEVEL_SLOPE = 0.1  # m/m: steady errors on steeper ground do not shift commands
 SLOW_CELLS, LONGEST_MEMORY_S = MEMORY // 4, 4.0  # cells of a new student that forget slowly, up to this time
@@ -513,6 +516,7 @@ def smooth_labels(actions: np.ndarray, mask: np.ndarray) -> np.ndarray:
     first, last = np.maximum(ticks - LABEL_BEFORE, 0), np.minimum(ticks + LABEL_AFTER, len(actions) - 1)
 
     def window_sum(values: np.ndarray) -> np.ndarray:
+        """Sum of the values (T, N, k) in the window of each tick."""
         running = np.concatenate([np.zeros_like(values[:1], float), values.cumsum(axis=0, dtype=float)])
         return np.asarray(running[last + 1] - running[first])
 

@@ -20,7 +20,7 @@ from typing_extensions import override
 from quadvel_description import symmetry
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
-from quadvel_description.symmetry import Mirror
+from quadvel_description.symmetry import sign_mirror
 from quadvel_sim.terrain import Terrain
 
 from . import loop, process_group
@@ -44,26 +44,22 @@ ACTION_BOUND = 4.0  # in the network's unit
 WALKING_HEIGHT_M = 0.38  # typical height of the trunk of a robot of the reference size
 
 
-def _signs(*signs: float) -> Mirror:
-    """Build a mirror that only changes signs."""
-    return Mirror(np.arange(len(signs)), np.array(signs, float))
-
-
-_PLANAR = _signs(1, -1, -1)
+PLANAR = sign_mirror(1, -1, -1)
+"""Mirror of vx, vy and yaw rate"""
 MIRROR = symmetry.concatenate_mirrors(
     [
         symmetry.OBSERVATION,
         symmetry.FEET,  # contact
         symmetry.FEET,  # clearance
-        _signs(1),  # height
-        _PLANAR,  # error over a stride
-        _PLANAR,  # lasting error
-        _signs(1, -1),  # slope of the ground
+        sign_mirror(1),  # height
+        PLANAR,  # error over a stride
+        PLANAR,  # lasting error
+        sign_mirror(1, -1),  # slope of the ground
         symmetry.FEET,  # friction
-        _signs(1),  # payload
-        _signs(1, -1, 1),  # shift of the centre of mass
-        _signs(-1, -1),  # phase of the steps
-        _PLANAR,  # planned velocity
+        sign_mirror(1),  # payload
+        sign_mirror(1, -1, 1),  # shift of the centre of mass
+        sign_mirror(-1, -1),  # phase of the steps
+        PLANAR,  # planned velocity
     ]
 )
 OBSERVATION_SIZE = len(MIRROR.index)

@@ -38,7 +38,9 @@ RATE_S = np.array([0.025, 0.08])  # time that a roll or pitch rate is extrapolat
 HEIGHT_GAIN = 0.54  # share of the height above HEIGHT_M by which stance feet of a walk give way,
 MAX_HEIGHT_ERROR_M = 0.1  # up to this error
 LOAD = 1.7  # share of the load of a stance foot that is fed forward
-LOADING = 0.08  # cycles in which a stance takes and leaves its load, half of them before it starts and ends
+LOADING = (
+    0.08  # cycles in which a stance gains and loses its load, half of them before touchdown and lift-off
+)
 
 
 def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.ndarray:

@@ -4,8 +4,8 @@ Robots of different size move alike if lengths grow with their height h, times w
 speeds with sqrt(g h); the Froude number v^2 / (g h) is then the same. Source: Alexander and Jayes,
 A dynamic similarity hypothesis for the gaits of quadrupedal mammals (1983).
 
-So the script, its clock and the heights in the rewards hold their numbers once, for a robot whose hips
-are `REFERENCE_HEIGHT_M` above its feet. What the teacher observes does not scale.
+So the script, its clock, what the teacher observes and the heights in the rewards hold their numbers
+once, for a robot whose hips are `REFERENCE_HEIGHT_M` above its feet.
 """
 
 from __future__ import annotations

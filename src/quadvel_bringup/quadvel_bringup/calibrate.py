@@ -103,11 +103,9 @@ def calibrate_command(
 
 def _robot(paths: list[Path], asked: str | None) -> Robot:
     """Return the robot of the recordings; ValueError if they, or `asked`, are of different ones."""
-    robot = robot_of_file(paths[0], described_robot(recorded_description(paths[0])), asked)
-    for path in paths[1:]:
-        named = described_robot(recorded_description(path))
-        if named not in (None, robot.name):
-            raise ValueError(f"{path}: robot is {named!r}, expected {robot.name!r}")
+    for path in paths:
+        robot = robot_of_file(path, described_robot(recorded_description(path)), asked)
+        asked = asked or robot.name
     return robot
 
 

@@ -27,7 +27,7 @@ PUBLISH_PERIOD_S = 0.05
 """Time between two messages; the command mux drops a source after 0.5 s."""
 SETTLING_TIME_S = 0.5
 """Time after the command is in full effect before the measured velocity is averaged."""
-STANDS = ("stance", "walk")
+READY_MODES = ("stance", "walk")
 """Modes in which a robot may be about to follow velocities."""
 READY_TIMEOUT_S = 1.0
 """Time for a robot that just stood up, or was paused, to follow velocities again."""
@@ -75,7 +75,9 @@ class DriveRun:
             return ""
         self._wait(lambda: self._states[-1].mode_name != "stand_up", MODE_TIMEOUT_S)
         # After standing up, the controller waits for the mux's zero command; after a pause, for states.
-        self._wait(lambda: self._states[-1].mode_name not in STANDS or not self.refusal(), READY_TIMEOUT_S)
+        self._wait(
+            lambda: self._states[-1].mode_name not in READY_MODES or not self.refusal(), READY_TIMEOUT_S
+        )
         return self.refusal()
 
     def _wait(self, is_so: Callable[[], Any], seconds: float) -> bool:

@@ -37,20 +37,27 @@ class Mirror:
         return np.eye(len(self.index))[self.index] * self.sign[:, None]
 
 
-def _signs(*signs: float) -> Mirror:
-    """Return a mirror that changes signs only."""
+def sign_mirror(*signs: float) -> Mirror:
+    """Build a mirror that changes signs only.
+
+    Args:
+        signs: The signs.
+
+    Returns:
+        The mirror.
+    """
     return Mirror(np.arange(len(signs)), np.array(signs, float))
 
 
 JOINTS = Mirror(np.array([3 * leg + k for leg in _LEG_SWAP for k in range(3)]), np.tile([-1.0, 1.0, 1.0], 4))
 FEET = Mirror(np.array(_LEG_SWAP), np.ones(4))
 MIRRORS = {
-    "command": _signs(1, -1, -1, 1),
-    "roll_pitch": _signs(-1, 1),
+    "command": sign_mirror(1, -1, -1, 1),
+    "roll_pitch": sign_mirror(-1, 1),
     "q": JOINTS,
     "dq": JOINTS,
-    "linear_velocity": _signs(1, -1, 1),
-    "angular_velocity": _signs(-1, 1, -1),
+    "linear_velocity": sign_mirror(1, -1, 1),
+    "angular_velocity": sign_mirror(-1, 1, -1),
     "previous_action": JOINTS,
 }
 """Mirror of each part of an observation, by the part's name in the policy file."""
