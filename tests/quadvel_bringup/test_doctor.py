@@ -29,6 +29,13 @@ def test_without_the_simulator_only_a_robot_can_run() -> None:
     assert possible[0].startswith("a robot's nodes")
 
 
+def test_without_a_shipped_policy_no_demo_can_run() -> None:
+    abilities = dict(doctor.abilities([*GOOD, Finding("robot files", False, "no policy is shipped")]))
+    (demo,) = (possible for name, possible in abilities.items() if "demo" in name and "video" not in name)
+    assert not demo
+    assert not abilities["the video of the demo"]
+
+
 def test_a_backend_that_cannot_draw_is_not_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "no such backend")
     assert doctor.gl_backend() is None

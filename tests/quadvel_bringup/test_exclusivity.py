@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from quadvel_bringup.exclusivity import running_robots
+from quadvel_bringup.exclusivity import running_robots, warn_beside_a_robot
 
 SLEEP = "import time; print(flush=True); time.sleep(60.0)"
 
@@ -52,3 +52,19 @@ def test_a_node_of_quadvel_up_is_known_by_its_module(tmp_path: Path) -> None:
 
 def test_a_command_that_only_starts_a_robot_is_none() -> None:
     assert robot_name(["timeout", "60", sys.executable, "-c", SLEEP, "run", "board"]) is None
+
+
+def test_a_simulator_that_starts_beside_a_robot_is_warned(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "97")
+    warn_beside_a_robot()
+    assert capsys.readouterr().err == ""
+    script = tmp_path / "sim_node"
+    script.write_text(SLEEP)
+    with subprocess.Popen([sys.executable, "-S", str(script)], stdout=subprocess.PIPE) as process:
+        assert process.stdout
+        assert process.stdout.readline()
+        warn_beside_a_robot()
+        process.terminate()
+    assert f"sim_node (pid {process.pid}" in capsys.readouterr().err

@@ -209,6 +209,12 @@ def test_a_recording_on_which_nothing_came_leaves_no_file(tmp_path: Path) -> Non
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_recorder_of_faults_that_hears_no_controller_ends_with_1(tmp_path: Path) -> None:
+    recording = start_recording("--ring", "2", "--out", str(tmp_path / "faults"), "--seconds", "0.5")
+    recording.communicate(timeout=60)
+    assert recording.returncode == 1
+
+
 def test_a_ring_keeps_the_last_seconds_and_what_is_published_once(tmp_path: Path) -> None:
     ring = RingBuffer(2.0)
     blank = bytes(300)

@@ -17,7 +17,7 @@ from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_recordings import bounds
 from quadvel_recordings.definitions import STORE
 from quadvel_recordings.joint_log import LEG_JOINTS, JointLog, read_joint_log, require_commands
-from quadvel_recordings.reading import RecordingError, read_messages
+from quadvel_recordings.reading import RecordingError, lazy_messages, read_messages
 from tests.quadvel_recordings.joint_bags import (
     PERIOD,
     ROWS,
@@ -207,6 +207,12 @@ def test_first_bytes_of_a_file_count_more_than_its_suffix(tmp_path: Path) -> Non
     metadata = path / "metadata.yaml"
     metadata.write_text(metadata.read_text().replace("bag.mcap", "bag.db3").replace(": mcap", ": sqlite3"))
     check(read_joint_log(path, notify=lambda _: None))
+
+
+def test_a_file_that_is_no_recording_is_refused_by_its_suffix(tmp_path: Path) -> None:
+    (tmp_path / "README.md").write_text("# A page")
+    with pytest.raises(RecordingError, match=r"README\.md: the suffix is '\.md', expected \.mcap"):
+        next(lazy_messages(tmp_path / "README.md", lambda topic, kind: True))
 
 
 @pytest.mark.parametrize("storage", list(StoragePlugin))

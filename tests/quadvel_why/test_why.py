@@ -178,6 +178,23 @@ def test_the_command_writes_the_finding_and_ends_with_1(run: Run, tmp_path: Path
     assert (tmp_path / "out" / "why.png").stat().st_size > 1000
 
 
+def test_several_recordings_have_a_folder_each(run: Run, tmp_path: Path) -> None:
+    now = np.maximum(run.command_rows(0.0), 0)
+    log = {"t": run.time, "q": run.q, "dq": run.dq, "q_des": run.commands.q[now]}
+    files = [tmp_path / "a.npz", tmp_path / "b.npz", tmp_path / "again" / "a.npz"]
+    files[2].parent.mkdir()
+    for file in files:
+        np.savez(file, **log)  # type: ignore[arg-type]
+    options = ["--gains", "30", "0.5", "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit) as ended:
+        cli.command("why").main([str(files[0]), str(files[1]), *options])
+    assert ended.value.code in (0, 1)
+    assert sorted(path.parent.name for path in tmp_path.glob("out/*/why.json")) == ["a", "b"]
+    with pytest.raises(SystemExit) as ended:
+        cli.command("why").main([str(files[0]), str(files[2]), *options])
+    assert ended.value.code == 2
+
+
 def test_a_table_with_other_names_is_read_by_a_column_map(run: Run, tmp_path: Path) -> None:
     now = np.maximum(run.command_rows(0.0), 0)
     np.savez(tmp_path / "bench.npz", t=run.time, angles=run.q, dq=run.dq, goal=run.commands.q[now])

@@ -146,6 +146,8 @@ class Interrupt:
     def _ask(self, *_: object) -> None:
         """Note the request, and restore the handler for a second one."""
         self.requested = True
+        if process_group.rank() == 0:
+            print("\nends after this update, and writes its checkpoint; a second Ctrl-C ends at once")
         signal.signal(signal.SIGINT, self._before)
 
 

@@ -267,6 +267,7 @@ def run(
 ) -> None:
     """Run one node in this process; the help is RUN_HELP."""
     from . import nodes
+    from .exclusivity import warn_beside_a_robot
     from .preflight import check_arguments
 
     arguments = [*context.args]
@@ -274,6 +275,8 @@ def run(
         file = json.dumps(str(actuator.resolve()))
         arguments = [*(arguments or ["--ros-args"]), "-p", f"actuator_file:={file}"]
     check_arguments(node, arguments)
+    if node == "sim_node":
+        warn_beside_a_robot()
     nodes.run(node, arguments)
 
 
@@ -575,10 +578,10 @@ def record(
     from .record import record_faults
 
     if ring is not None:
-        record_faults(out or Path("out/faults"), topics or [], ring, seconds)
-        return
-    out = out or Path("out/record.mcap")
-    if not run_record(out, topics or [], seconds):
+        heard = record_faults(out or Path("out/faults"), topics or [], ring, seconds)
+    else:
+        heard = bool(run_record(out or Path("out/record.mcap"), topics or [], seconds))
+    if not heard:
         raise typer.Exit(1)
 
 

@@ -248,11 +248,15 @@ def abilities(findings: list[Finding]) -> Iterator[tuple[str, bool]]:
     good = {finding.subject: finding.good for finding in findings}
     runs = good["Python"] and all(good[name] for name in REQUIRED_PACKAGES)
     robot = good["Python"] and all(good[name] for name in ROBOT_PACKAGES)
+    shipped = good.get("robot files", True)
     torch = any(finding.subject == "torch" and "training can run" in finding.text for finding in findings)
     yield "a robot's nodes (quadvel up --low-level driver), drive, status", robot
-    yield "quadvel demo, up, run, record", runs
-    yield "quadvel eval, bench", runs
-    yield "the video of the demo", runs and good["GL"] and good["ffmpeg"]
+    if shipped:
+        yield "quadvel demo, up, run, record, eval, bench", runs
+    else:
+        yield "quadvel up, run, record, eval, bench with --policy FILE", runs
+        yield "quadvel demo: it needs a shipped policy", False
+    yield "the video of the demo", runs and shipped and good["GL"] and good["ffmpeg"]
     yield "training", runs and torch
 
 

@@ -6,6 +6,7 @@ Two of them would send conflicting states and commands.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping
 from itertools import dropwhile
 from pathlib import Path
@@ -16,6 +17,8 @@ from quadvel_nodes.publishers import DISCOVERY_TIME_S, has_publisher
 TOPIC = "low_state"
 ROBOT_PROGRAMS = ("sim_node", "board", "driver", "quadvel_lab.plant")
 """Nodes and modules of drivers and simulated robots."""
+PUBLISHERS = {"sim_node", "driver"}
+"""Those nodes of them that publish low_state."""
 LOADED_DISCOVERY_TIME_S = 4.0
 """Time to discover other publishers if one of ROBOT_PROGRAMS runs on this machine, which may be busy and answer late."""
 
@@ -35,17 +38,41 @@ def ensure_exclusive(node: Any) -> None:
     """
     if has_publisher(node, TOPIC, LOADED_DISCOVERY_TIME_S if robots_on_domain() else DISCOVERY_TIME_S):
         raise RobotAlreadyRunningError(
-            f"{TOPIC}: already published on ROS domain {ros_domain()} by {_describe_robots()}. Stop it, or set "
+            f"{TOPIC}: already published on ROS domain {ros_domain()} by {describe_robots()}. Stop it, or set "
             "ROS_DOMAIN_ID to another number"
         )
 
 
-def _describe_robots() -> str:
-    """Name the robot programs of this machine and domain, or other possible causes."""
+def describe_robots() -> str:
+    """Name the robots of this ROS domain.
+
+    Returns:
+        Programs of this machine with their process ids, or other possible causes.
+    """
     found = robots_on_domain()
     if not found:
         return "a robot, another host or user, or a process that was killed less than 10 s ago"
-    return ", ".join(f"{name} (pid {pid}{_started_by(pid)})" for pid, name in found.items())
+    return _listed(found)
+
+
+def warn_beside_a_robot() -> None:
+    """Warn on stderr before a simulator starts next to a robot of this machine and domain.
+
+    The simulator does not search the network: its start would take seconds longer. The controller's
+    guard does (docs/faults.md).
+    """
+    others = {pid: name for pid, name in robots_on_domain().items() if name in PUBLISHERS}
+    if others:
+        print(
+            f"quadvel: warning: {_listed(others)} publishes {TOPIC} on ROS domain {ros_domain()}, too: "
+            "end one of the two",
+            file=sys.stderr,
+        )
+
+
+def _listed(robots: Mapping[int, str]) -> str:
+    """Name programs with their process ids."""
+    return ", ".join(f"{name} (pid {pid}{_started_by(pid)})" for pid, name in robots.items())
 
 
 def robots_on_domain() -> dict[int, str]:

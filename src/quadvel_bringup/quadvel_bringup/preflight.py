@@ -142,7 +142,9 @@ def check_arguments(name: str, arguments: Sequence[str]) -> None:
     names |= {rule.value: name for rule in found.remappings if rule.name == "__node"}
     namespaces = {override.pattern.rpartition("/")[0] for override in found.overrides}
     _check_names(
-        found.overrides, {f"{space}/{own}": node for space in namespaces for own, node in names.items()}
+        found.overrides,
+        {f"{space}/{own}": node for space in namespaces for own, node in names.items()},
+        running=name,
     )
 
 
@@ -160,8 +162,14 @@ def _check_file(file: Path) -> None:
         raise ValueError(f"{file}: {error}") from None
 
 
-def _check_names(overrides: Iterable[ParameterOverride], nodes: Mapping[str, str]) -> None:
-    """Check names of nodes and parameters; `nodes`: key in NODES by full name."""
+def _check_names(overrides: Iterable[ParameterOverride], nodes: Mapping[str, str], running: str = "") -> None:
+    """Check names of nodes and parameters.
+
+    Args:
+        overrides: The parameters.
+        nodes: Key in NODES by full name.
+        running: The only node that runs, whose parameters an error then lists; "" for all.
+    """
     for override in overrides:
         meant = {node for full_name, node in nodes.items() if override.applies_to(full_name)}
         if not meant:
@@ -169,8 +177,10 @@ def _check_names(overrides: Iterable[ParameterOverride], nodes: Mapping[str, str
             raise ValueError(f"found a section for '{override.pattern}', {hint}")
         known = [name for node in NODES if node in meant for name in _parameter_names()[node]]
         if override.name not in known and not _is_of_rclpy(override.name):
+            meant = {running} if running in meant else meant
             place = meant.pop() if len(meant) == 1 else override.pattern
-            raise ValueError(f"{place}: found the parameter {override.name}, {_hint(override.name, known)}")
+            listed = _parameter_names().get(place, list(dict.fromkeys(known)))
+            raise ValueError(f"{place}: found the parameter {override.name}, {_hint(override.name, listed)}")
 
 
 @cache

@@ -81,7 +81,7 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
     return recorder.counts.total()
 
 
-def record_faults(folder: Path, topics: Sequence[str], before: float, seconds: float | None) -> int:
+def record_faults(folder: Path, topics: Sequence[str], before: float, seconds: float | None) -> bool:
     """Record the time around each fault, to a file named after time and fault.
 
     Args:
@@ -91,7 +91,7 @@ def record_faults(folder: Path, topics: Sequence[str], before: float, seconds: f
         seconds: Duration, s, or None for until Ctrl-C.
 
     Returns:
-        Number of recorded faults.
+        Whether a controller was heard; without one no fault can be recorded.
     """
     output_folder(folder)
     quadvel_dds.install()
@@ -113,7 +113,7 @@ def record_faults(folder: Path, topics: Sequence[str], before: float, seconds: f
 
     with (
         StopSignals() as signals,
-        console.status(f"keeping the last {before:g} s for a fault; Ctrl-C stops"),
+        console.status("no controller is heard yet; Ctrl-C stops") as shown,
         Session("recorder", rights="recorder") as session,
         Recorder(session.node, ring) as recorder,
     ):
@@ -121,12 +121,17 @@ def record_faults(folder: Path, topics: Sequence[str], before: float, seconds: f
         while not signals.received and (left := ends - time.monotonic()) > 0.0:
             recorder.record_all(_with_description(wanted))
             recorder.serve(session.executor, min(DISCOVERY_PERIOD_S, left))
+            if faults.has_heard:
+                shown.update(f"keeping the last {before:g} s for a fault; Ctrl-C stops")
             if faults.is_due:
                 save()
         if faults.is_open:
             save()
+    if not faults.has_heard:
+        console.print(f"no controller was heard on ROS domain {ros_domain()}, so no fault could be recorded")
+        return False
     console.print(f"{faults.count} {'fault' if faults.count == 1 else 'faults'} recorded in {folder}")
-    return faults.count
+    return True
 
 
 class FaultTrigger:
@@ -138,14 +143,15 @@ class FaultTrigger:
     Attributes:
         reason: Reason of the last fault.
         count: Number of saved faults.
+        has_heard: Whether any state has arrived.
     """
 
     def __init__(self, mode: int) -> None:
-
         self._mode, self._was = mode, False
         self._due = float("inf")
         self._name = self.reason = ""
         self.count = 0
+        self.has_heard = False
 
     def on_state(self, state: Any) -> None:
         """Process a state of the controller.
@@ -153,6 +159,7 @@ class FaultTrigger:
         Args:
             state: A ControllerState.
         """
+        self.has_heard = True
         is_fault = state.mode == self._mode
         if is_fault and not self._was and not self.is_open:
             self._name, self.reason = state.fault, state.reason

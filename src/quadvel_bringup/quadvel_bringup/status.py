@@ -24,6 +24,7 @@ from quadvel_nodes.topic_types import all_conflicts
 
 from .discovery_hint import discovery_hint
 from .drive import twist_to_array, velocity_text
+from .exclusivity import describe_robots
 from .operator_commands import RECOVERY_HINT
 from .session import DISCOVERY_TIMEOUT_S, Session
 
@@ -83,7 +84,8 @@ def status(joints: bool = False) -> int:
         robots = session.node.count_publishers("low_state")
         if robots > 1:
             conflicts.append(
-                f"[red]error[/] low_state has {robots} publishers, expected 1: end all robots but one"
+                f"[red]error[/] low_state has {robots} publishers, expected 1: end all but one; "
+                f"they are {describe_robots()}; the lines show one node of each name"
             )
     nodes = nodes_from_diagnostics(heard["/diagnostics"])
     if not nodes:

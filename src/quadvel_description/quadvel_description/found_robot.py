@@ -136,7 +136,7 @@ def _compile(path: Path) -> mujoco.MjModel:
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise UnsupportedRobotError(path, "file", f"MuJoCo cannot read it: {error}") from None
+        raise UnsupportedRobotError(path, "file", f"no MJCF or URDF that MuJoCo can read: {error}") from None
     spec.compiler.fusestatic = False
     for geom in [geom for geom in spec.geoms if geom.type == _MESH]:
         spec.delete(geom)

@@ -71,6 +71,7 @@ class Driver(Node):
         self._reports = 0
         self._passive_wanted = False
         self._last_logged = ""
+        self._last_level = Level.ERROR
         self._failure = ""
         self._set_mode = self.create_client(SetMode, "controller/set_mode")
         self._enable_walking = self.create_client(SetBool, "controller/enable_walking")
@@ -231,6 +232,9 @@ class Driver(Node):
         self._reports += 1
         if level > Level.OK and self._reports > STARTUP_REPORTS:
             self.get_logger().warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
+        elif level == Level.OK != self._last_level:
+            self.get_logger().info(f"the joints of {self._robot.title} are under control: {summary}")
+        self._last_level = level
 
 
 def motor_status(stamp: Any, state: BoardState, robot: Robot) -> Any:

@@ -24,6 +24,8 @@ from .truncated import is_truncated, recover_messages, recovery_summary
 
 STORAGES = {".mcap": "mcap", ".db3": "sqlite3"}
 """Storage identifiers of metadata.yaml by suffix of the file."""
+SUFFIXES = (*STORAGES, ".bag")
+"""Suffixes of recordings of ROS 2 and ROS 1."""
 MAGIC = {b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
 """Suffixes by first bytes of the file; these count more than its name."""
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -144,6 +146,9 @@ def _recording_files(path: Path, notify: Callable[[str], None] | None) -> Sequen
     if not path.is_dir():
         if path.suffix == ".zstd":
             raise RecordingError(f"{path}: {_unpack_advice(path)}")
+        if _storage_suffix(path) not in SUFFIXES:
+            expected = f"{', '.join(SUFFIXES)} or a folder of rosbag2"
+            raise RecordingError(f"{path}: the suffix is '{path.suffix}', expected {expected}")
         return [path]
     files = _data_files(path)
     metadata = path / "metadata.yaml"

@@ -204,7 +204,10 @@ def _identify(
 ) -> Identification:
     """Read the logs and identify the model; findings and progress go to `messages`."""
     parts = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*parts, console=messages, transient=True) as bar, threadpool_limits(1):
+    with (
+        Progress(*parts, console=messages, transient=True, disable=not messages.is_terminal) as bar,
+        threadpool_limits(1),
+    ):
         task = bar.add_task("reading", total=1.0)
 
         def on_progress(share: float, text: str) -> None:

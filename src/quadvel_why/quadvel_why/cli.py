@@ -18,20 +18,25 @@ from quadvel_sysid.logs.readers.recordings import Topics
 from .diagnosis import diagnose
 from .reading import read_run
 from .report import picture, summary, to_json
+from .run import Run
 from .signals import Signals
 
 
 def why_command(
-    recording: Annotated[
-        Path,
+    recordings: Annotated[
+        list[Path],
         typer.Argument(
-            help="A recording (MCAP, rosbag2, ROS 1), or a table of joints as `quadvel identify` reads it.",
+            help="Recordings (MCAP, rosbag2, ROS 1), or tables of joints as `quadvel identify` reads them.",
             show_default=False,
         ),
     ],
-    out: Annotated[Path, typer.Option(metavar="<folder>", help="Folder for why.json and why.png.")] = Path(
-        "out/why"
-    ),
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="<folder>",
+            help="Folder for why.json and why.png; of several recordings, for a folder each.",
+        ),
+    ] = Path("out/why"),
     policy: Annotated[
         Path | None,
         typer.Option(
@@ -79,6 +84,8 @@ def why_command(
     For example, record until the robot falls, then ask:
       quadvel record --out fall.mcap
       quadvel why fall.mcap
+    all faults that `quadvel record --ring` has recorded:
+      quadvel why out/faults/*.mcap
     with a policy of your own, or the log of another robot:
       quadvel why fall.mcap --policy mine.onnx
       quadvel why walk.npz --gains 35 0.5
@@ -89,9 +96,33 @@ def why_command(
       1  a link breaks; it is named
       2  a wrong argument or file
     """
-    output_folder(out)
     names = None if columns is None else ColumnMap.load(columns)
-    run = read_run(recording, gains, robot, names, Topics(state_topic, command_topic))
+    folders = [out if len(recordings) == 1 else out / recording.stem for recording in recordings]
+    if len({*folders}) < len(folders):
+        raise typer.BadParameter("recordings of one name would have one folder; ask about each alone")
+    broken = False
+    for recording, folder in zip(recordings, folders, strict=True):
+        output_folder(folder)
+        if len(recordings) > 1:
+            typer.echo(f"{recording}:")
+        run = read_run(recording, gains, robot, names, Topics(state_topic, command_topic))
+        broken |= _answer(run, recording, policy, folder)
+    if broken:
+        raise typer.Exit(1)
+
+
+def _answer(run: Run, recording: Path, policy: Path | None, out: Path) -> bool:
+    """Print and write the diagnosis of a run.
+
+    Args:
+        run: What was recorded.
+        recording: Its file, for warnings.
+        policy: ONNX file of the policy that drove; None: the shipped one.
+        out: Folder for why.json and why.png.
+
+    Returns:
+        Whether a link breaks.
+    """
     driver = chosen_policy(run.robot, str(policy or "")) if policy is not None or run.is_own else None
     for remark in run.remarks:
         typer.echo(f"quadvel: warning: {recording}: {remark}", err=True)
@@ -111,5 +142,4 @@ def why_command(
             picture(diagnosis.finding).savefig(draft, dpi=110, format="png")
         written.append("why.png")
     typer.echo(f"written: {out}/{', '.join(written)}")
-    if diagnosis.finding is not None:
-        raise typer.Exit(1)
+    return diagnosis.finding is not None

@@ -24,6 +24,7 @@ chain contract, timing, sensors, estimator, drives, ground, task:
     quadvel record --out fall.mcap       # while it happens; Ctrl-C stops
     quadvel why fall.mcap                # names the cause; writes out/why/why.json and why.png
     quadvel why fall.mcap --policy mine.onnx
+    quadvel why out/faults/*.mcap        # all faults of `quadvel record --ring`, each with its own folder
     quadvel why walk.npz --gains 35 0.5  # joints of another robot, as `quadvel identify` reads them
 
 ![Torque of a joint, and the torque that its command asks for](images/why.png)
