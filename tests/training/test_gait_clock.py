@@ -179,15 +179,6 @@ def test_the_scripted_trot_alone_runs(robot):
     assert np.abs(np.mean(height[100:], axis=0) / size.length - 0.37).max() < 0.04
 
 
-def test_a_walk_that_starts_with_the_other_pair_is_half_a_cycle_apart() -> None:
-    clock = GaitClock(2)
-    clock.reset(np.arange(2), other_pair=np.array([False, True]))
-    command, none = np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)), np.zeros((2, 4), bool)
-    for _ in range(20):
-        clock.advance(command, np.zeros(2), none, 0.02)
-        np.testing.assert_allclose(clock.foot_phases()[1], clock.foot_phases()[0][[1, 0, 3, 2]])
-
-
 @pytest.mark.parametrize("vx", [0.5, 2.0, -1.5])
 def test_the_targets_of_the_script_do_not_jump_over_a_cycle(vx):
     """The policy learns from them: a jump would be jitter of its joint targets."""

@@ -173,6 +173,51 @@ class Experience:
         return Experience(*(torch.cat(pair, dim=1) for pair in pairs))
 
 
+class Drift:
+    """Mean velocity errors of robots while they are steady at their present command.
+
+    Attributes:
+        seconds: (n,), time for which each was steady.
+        integral: (n, 3), of its errors over that time, m, m, rad.
+    """
+
+    def __init__(self, n: int) -> None:
+        """Begin.
+
+        Args:
+            n: number of robots.
+        """
+        self.seconds, self.integral = np.zeros(n), np.zeros((n, 3))
+
+    def advance(self, error: np.ndarray, steady: np.ndarray, changed: np.ndarray) -> None:
+        """Count a tick.
+
+        Args:
+            error: (n, 3), command minus velocity, m/s, m/s, rad/s.
+            steady: (n,) bool, whether the tick counts.
+            changed: (n,) bool, whether the command has changed, so that the robot begins again.
+        """
+        self.seconds += TICK_S * steady
+        self.integral += TICK_S * steady[:, None] * error
+        self.seconds[changed], self.integral[changed] = 0.0, 0.0
+
+    @property
+    def is_known(self) -> np.ndarray:
+        """Whether each robot was steady for long enough, (n,) bool."""
+        return np.asarray(self.seconds > SHORTEST_STEADY_S)
+
+    def mean(self, robots: np.ndarray) -> np.ndarray:
+        """Mean errors of some robots.
+
+        Args:
+            robots: (n,) bool, robots whose drift is known.
+
+        Returns:
+            (k, 3), m/s, m/s, rad/s.
+        """
+        return np.asarray(self.integral[robots] / self.seconds[robots, None])
+
+
 class Teacher:
     """Teacher of a checkpoint, evaluated at every tick, with averaged actions and shifted commands.
 
@@ -204,14 +249,13 @@ class Teacher:
         self._starts = np.ones(n, bool)
         self.latest = np.zeros((n, 12), np.float32)
 
-    def reset(self, ids: np.ndarray, other_pair: np.ndarray | bool = False) -> None:
+    def reset(self, ids: np.ndarray) -> None:
         """Clear the past of some robots.
 
         Args:
             ids: their indices.
-            other_pair: (len(ids),) bool, whether their walks start with the feet FL and RR.
         """
-        self.past.reset(ids, other_pair)
+        self.past.reset(ids)
         for action in self._executed:
             action[ids] = 0.0
         self._starts[ids] = True
@@ -360,10 +404,7 @@ class DaggerRun:
         self.env.reset(ids)
         self.driven[ids] = self._turn[ids] < self._share()
         self._setting_off[ids] = True
-        # The student starts with FR and RL. Half of the teacher's robots start with the other pair,
-        # so that the student takes its phase from the motion, and walks mirrored as well.
-        other_pair = ~self.driven[ids] & (self.env.rng.random(len(ids)) < 0.5)
-        self.teacher.reset(ids, other_pair)
+        self.teacher.reset(ids)
         self._previous[ids] = self._noise[ids] = 0.0
         self._memory = (self._memory[0].clone(), self._memory[1].clone())
         for memory in self._memory:
@@ -402,45 +443,57 @@ class DaggerRun:
         Returns:
             The sequences, (T, N) which robots stood, and figures for the log.
         """
-        env, c = self.env, self.config
-        # Ornstein-Uhlenbeck noise: n <- d n + noise sqrt(1 - d^2) w, d = exp(-dt / noise_time)
-        decay = np.float32(np.exp(-TICK_S / c.noise_time))
-        drawn_std = np.float32(c.noise * np.sqrt(1 - decay**2))
+        c = self.config
         alive, fell = np.ones(c.n, bool), np.zeros(c.n, bool)
-        drift, steady_s = np.zeros((c.n, 3)), np.zeros(c.n)  # integral of steady errors, and its time
+        drift = Drift(c.n)
         rows: dict[str, list[np.ndarray]] = {name: [] for name in attrs.fields_dict(Experience)}
         standing = []
         for _ in range(c.length):
-            obs, advice = observe(env, self._previous), self.teacher.action()
-            own = self._act(obs)
-            drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
-            self._noise = decay * self._noise + drawn_std * drawn * self._explores[:, None]
-            self._previous = np.where(self.driven[:, None], own, advice) + self._noise
-            row = obs, self.teacher.latest, self.teacher.past_features(), alive.copy()
-            for values, value in zip(rows.values(), row, strict=True):
+            obs, advice = observe(self.env, self._previous), self.teacher.action()
+            seen = obs, self.teacher.latest, self.teacher.past_features(), alive.copy()
+            for values, value in zip(rows.values(), seen, strict=True):
                 values.append(value)
-            past = self.teacher.past
-            self._setting_off &= ~(past.air > past.clock.shortest_swing).any(axis=1)
-            standing.append(past.standing | self._setting_off)
-            command = env.command.copy()
-            env.tick(self.map.targets(self._previous))
-            self.teacher.advance(command, self._previous)
-            steady = self._steady(command)
-            steady_s += TICK_S * steady
-            drift += TICK_S * steady[:, None] * velocity_error(env, command)
-            drift[env.changed], steady_s[env.changed] = 0.0, 0.0
-            fell |= env.fallen & alive
-            alive &= ~(env.fallen | env.timed_out)
-        seen = self._figures(alive, fell)  # with the shift that was in force
-        counts = alive & (steady_s > SHORTEST_STEADY_S)
-        self.teacher.shift.add(env.command[counts], drift[counts] / steady_s[counts, None])
+            standing.append(self._stands())
+            command = self.env.command.copy()
+            self._tick(obs, advice)
+            drift.advance(velocity_error(self.env, command), self._steady(command), self.env.changed)
+            fell |= self.env.fallen & alive
+            alive &= ~(self.env.fallen | self.env.timed_out)
+        figures = self._figures(alive, fell)  # with the shift that was in force
+        counts = alive & drift.is_known
+        self.teacher.shift.add(self.env.command[counts], drift.mean(counts))
         rows["mask"][-1] = alive  # robots that end in the last tick count as ended, too
         self.samples += c.length * c.n * process_group.size()
         arrays = {name: np.array(values, dtype=np.float32) for name, values in rows.items()}
         arrays["label"] = smooth_labels(arrays["label"], arrays["mask"])
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         stood = torch.from_numpy(np.array(standing, dtype=np.float32))
-        return Experience(**tensors), stood, seen
+        return Experience(**tensors), stood, figures
+
+    def _tick(self, obs: np.ndarray, advice: np.ndarray) -> None:
+        """Advance the robots by a tick, each with its driver's action and its exploration.
+
+        Args:
+            obs: (n, 48), observations of the student.
+            advice: (n, 12), actions of the teacher, in the network's unit.
+        """
+        env, c = self.env, self.config
+        # Ornstein-Uhlenbeck noise: n <- d n + noise sqrt(1 - d^2) w, d = exp(-dt / noise_time)
+        decay = np.float32(np.exp(-TICK_S / c.noise_time))
+        drawn_std = np.float32(c.noise * np.sqrt(1 - decay**2))
+        own = self._act(obs)
+        drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
+        self._noise = decay * self._noise + drawn_std * drawn * self._explores[:, None]
+        self._previous = np.where(self.driven[:, None], own, advice) + self._noise
+        command = env.command.copy()
+        env.tick(self.map.targets(self._previous))
+        self.teacher.advance(command, self._previous)
+
+    def _stands(self) -> np.ndarray:
+        """Whether robots (n,) stand, or have not lifted a foot since they stood."""
+        past = self.teacher.past
+        self._setting_off &= ~(past.air > past.clock.shortest_swing).any(axis=1)
+        return np.asarray(past.standing | self._setting_off)
 
     def _steady(self, command: np.ndarray) -> np.ndarray:
         """Whether the errors of robots (n,) show what the student does at a command, and not what else happens.

@@ -76,7 +76,6 @@ class GaitClock:
         phase: (n,), cycles since the planned touchdown of the feet FR and RL, 0 to 1.
         velocity: (n, 3), planned: vx, vy (m/s), yaw rate (rad/s).
         walking: (n,) bool, whether the plan has steps.
-        first: (n,), phase at which a walk starts: `START_PHASE`, or half a cycle later.
     """
 
     def __init__(self, n: int, size: Size = REFERENCE) -> None:
@@ -88,17 +87,15 @@ class GaitClock:
         """
         self.size = size
         self.phase, self.velocity = np.full(n, START_PHASE), np.zeros((n, 3))
-        self.walking, self.first = np.zeros(n, bool), np.full(n, START_PHASE)
+        self.walking = np.zeros(n, bool)
 
-    def reset(self, ids: np.ndarray, other_pair: np.ndarray | bool = False) -> None:
+    def reset(self, ids: np.ndarray) -> None:
         """Let some robots stand.
 
         Args:
             ids: their indices.
-            other_pair: (len(ids),) bool, whether their walks start with the feet FL and RR.
         """
-        self.first[ids] = np.where(other_pair, (START_PHASE + 0.5) % 1.0, START_PHASE)
-        self.phase[ids], self.velocity[ids], self.walking[ids] = self.first[ids], 0.0, False
+        self.phase[ids], self.velocity[ids], self.walking[ids] = START_PHASE, 0.0, False
 
     def advance(self, command: np.ndarray, speed: np.ndarray, stepped: np.ndarray, period: float) -> None:
         """Advance the plans; those of standing robots wait at the start of a walk.
@@ -117,7 +114,7 @@ class GaitClock:
         phase = self.phase + self.frequency * period
         error = (phase[:, None] + FOOT_PHASES + 0.5) % 1.0 - 0.5
         phase = (phase - CORRECTION * (error * stepped).sum(axis=1)) % 1.0
-        self.phase = np.where(self.walking, phase, self.first)
+        self.phase = np.where(self.walking, phase, START_PHASE)
         slow, pushed = REST_SPEED * self.size.speed, PUSHED_SPEED * self.size.speed
         at_rest = (speed < slow) & ~self.velocity.any(axis=1) & (self.swing_share() < 0.0).all(axis=1)
         self.walking = np.where(self.walking, ~at_rest, speed > pushed) | (command[:, 3] < 0.5)

@@ -48,16 +48,15 @@ class Past:
         self._age = np.zeros(n)  # s, since the plan has the commanded velocity
         self._landed, self._last = np.zeros((n, 4)), np.zeros((n, 4))  # m ahead of the hip: at touchdown, now
 
-    def reset(self, ids: np.ndarray, other_pair: np.ndarray | bool = False) -> None:
+    def reset(self, ids: np.ndarray) -> None:
         """Clear the past of some robots.
 
         Args:
             ids: their indices.
-            other_pair: (len(ids),) bool, whether their walks start with the feet FL and RR.
         """
         for array in (self.stride, self.lasting, self.lag, self.air, self.down, self.off_hip, self._age):
             array[ids] = 0.0
-        self.clock.reset(ids, other_pair)
+        self.clock.reset(ids)
 
     def advance(self, command: np.ndarray) -> None:
         """Update everything after a tick of the environment.
