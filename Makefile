@@ -40,7 +40,7 @@ paper: setup  ## measure the paper's figures; resumes after a stop; results in d
 ros: $(ROS_VENV)/.run  ## create .venv-ros with ROS 2's own rclpy; needs no ROS 2 installation
 
 test: $(VENV)/.test  ## install the test dependencies (torch too) and run the tests
-	$(PY) -m pytest -n 2 --dist loadfile
+	$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 ros-tests: $(ROS_VENV)/.test
 

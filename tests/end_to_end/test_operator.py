@@ -158,6 +158,17 @@ def test_drive_says_when_a_command_is_cut(up: Robot) -> None:
     assert "in effect" in text
 
 
+def test_two_that_drive_at_once_are_told_so(up: Robot) -> None:
+    with subprocess.Popen(
+        [*QUADVEL, "drive", "--vx", "-0.3", "--seconds", "5"], stdout=subprocess.PIPE, text=True
+    ) as other:
+        code, text = quadvel("drive", "--vx", "0.3", "--seconds", "4")
+        told = other.communicate(timeout=60)[0]
+    for ended, said in ((code, text), (other.returncode, told)):
+        assert ended == 1, said
+        assert "not followed: another program that publishes cmd_vel_teleop, too, commands the robot" in said
+
+
 def test_drive_refuses_what_is_no_number() -> None:
     code, text = quadvel("drive", "--vx", "nan")
     assert (code, text.strip()) == (2, "quadvel: --vx is nan, expected a finite number")

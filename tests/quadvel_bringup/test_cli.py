@@ -99,6 +99,14 @@ def test_a_wrong_call_ends_in_one_sentence_and_exit_code_2(arguments: list[str],
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.parametrize("command", [["record"], ["excite", "chirp"]])
+def test_a_recording_has_the_suffix_by_which_it_is_read(command: list[str], tmp_path: Path) -> None:
+    result = quadvel(*command, "--out", str(tmp_path / "walk.txt"))
+    assert result.returncode == 2
+    assert "walk.txt: the suffix is '.txt', expected .mcap" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_recording_replaces_no_file(tmp_path: Path) -> None:
     file = tmp_path / "walk.mcap"
     file.write_text("kept")

@@ -113,4 +113,4 @@ def test_the_summary_of_a_demo_shows_dashes() -> None:
 def test_the_hottest_temperatures_are_shown() -> None:
     values = {f"joint {k} temperature": str(20 + k) for k in range(9)} | {"fan temperature": "unknown"}
     shown = dict(_equipment({"driver": NodeReport(b"\0", "ok", values)}))["temperatures"]
-    assert shown == "joint 8 28, joint 7 27, joint 6 26 degrees C, the hottest of 9"
+    assert shown == "joint 8 28, joint 7 27, joint 6 26 degrees C, the hottest of 9 sensors"

@@ -1,6 +1,7 @@
 """Tests of the joint and link tables against Unitree's numbers."""
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -101,3 +102,5 @@ def test_a_robot_is_loaded_by_name_or_folder(tmp_path):
     assert load_robot("go2") is GO2
     with pytest.raises(FileNotFoundError, match="found 'spot', expected aliengo, go2 or the path"):
         load_robot("spot")
+    with pytest.raises(ValueError, match=r"expected a robot\.yaml or its folder; `quadvel robot check`"):
+        load_robot(str(Path(GO2.folder) / "robot.urdf"))

@@ -24,6 +24,7 @@ from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator import estimator, features
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.messages import write_low_cmd, write_low_state
+from quadvel_nodes.node import StartError
 from tests.helpers.robots import ALIENGO
 
 RECEIVED = {
@@ -111,6 +112,11 @@ def test_each_state_is_answered_with_the_network_s_velocity(
     np.testing.assert_allclose(
         np.reshape(answer.twist.covariance, (6, 6)).diagonal()[:3], [0.01, 0.0025, 0.0225], rtol=1e-5
     )
+
+
+def test_a_second_estimator_refuses_to_start(bench: Bench) -> None:
+    with pytest.raises(StartError, match="velocity_estimate is already published"):
+        estimator.EstimatorNode()
 
 
 def test_a_stall_of_the_whole_machine_moves_nothing(bench: Bench) -> None:

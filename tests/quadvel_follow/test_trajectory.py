@@ -270,7 +270,7 @@ def test_a_gpx_of_less_than_two_points_is_refused_with_their_count(tmp_path: Pat
         ("x,y\n", "no row"),
         ("x,y\n1,nan\n2,2\n", "row 2 is '1,nan', expected 2 finite numbers"),
         ("x,y\n1,1\n", "one place"),
-        ("seconds,vx,vy,wz\n-1,0,0,0\n", "seconds that are not above 0"),
+        ("seconds,vx,vy,wz\n-1,0,0,0\n", "duration that is not above 0"),
     ],
 )
 def test_files_that_are_no_way_are_refused_by_name(tmp_path: Path, text: str, words: str) -> None:

@@ -436,6 +436,24 @@ def test_set_mode_says_why_it_refuses(robot: Robot) -> None:
     assert response.message.startswith("mode is 'jump', expected one of")
 
 
+def test_the_requester_of_a_mode_is_named_in_its_reason(robot: Robot) -> None:
+    robot.stand()
+    request = {"mode": "passive", "requester": "STOP on the page"}
+    assert robot.graph.call(SetMode, "controller/set_mode", **request).success
+    robot.graph.diagnosed("passive: requested by STOP on the page")
+
+
+def test_a_second_controller_refuses_to_start_or_is_a_fault(robot: Robot) -> None:
+    robot.step(2)
+    robot.stand()
+    with pytest.raises(StartError, match="low_cmd is already published"):
+        Controller()
+    robot.graph.speak(LowCmd, "low_cmd")  # one that was discovered too late
+    robot.graph.diagnosed("low_cmd has 2 publishers, expected 1")
+    robot.step(5)
+    assert robot.report("fault").reason.startswith("low_cmd has 2 publishers")
+
+
 def test_a_second_robot_on_the_same_topic_is_a_fault_and_refuses_to_be_stood_up(robot: Robot) -> None:
     robot.step(2)
     robot.stand()

@@ -23,6 +23,12 @@ def test_by_default_they_are_the_nominal_robot() -> None:
     assert SimParameters().period == 5
 
 
+def test_a_slope_for_which_none_is_given_has_10_degrees() -> None:
+    assert SimParameters(terrain="slope").config().terrain.slope == pytest.approx(np.radians(10.0), abs=0.001)
+    assert SimParameters(terrain="slope", slope=-0.1).config().terrain.slope == -0.1
+    assert SimParameters(terrain="rough").config().terrain.slope == 0.0
+
+
 def test_each_reaches_the_record_that_it_belongs_to(tmp_path: Path) -> None:
     file = tmp_path / "actuator.yaml"
     ActuatorParameters.ideal(ALIENGO).save(file)

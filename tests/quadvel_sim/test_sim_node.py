@@ -138,6 +138,9 @@ def test_a_reset_puts_the_robot_on_other_ground(start: Start, peer: Any) -> None
     response = peer.call("reset", terrain="swamp")
     assert not response.success
     assert response.message == "Terrain.kind: found 'swamp', expected one of flat, slope, rough"
+    response = peer.call("reset", slope=0.1)
+    assert not response.success
+    assert response.message.startswith("slope: found 0.1 rad without a terrain")
     assert peer.call("reset", keyframe="stand", terrain="flat").success
     peer.spin_until(lambda: abs(odom[-1].pose.pose.orientation.y) < 0.02)
 

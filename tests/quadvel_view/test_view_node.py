@@ -28,6 +28,7 @@ class Service:
 
     def __init__(self) -> None:
         self.modes: list[str] = []
+        self.requesters: list[str] = []
         self.waiting: set[Answer] = set()
 
     def service_is_ready(self) -> bool:
@@ -35,6 +36,7 @@ class Service:
 
     def call_async(self, request: Any) -> Answer:
         self.modes.append(request.mode)
+        self.requesters.append(request.requester)
         answer = Answer()
         self.waiting.add(answer)
         return answer
@@ -72,6 +74,7 @@ def test_stop_passes_orders_that_came_before_it(view: View) -> None:
     view._on_message(2, Stop())
     assert spin_until_stopped(view) < 0.5
     assert view._set_mode.modes == ["passive"]
+    assert view._set_mode.requesters[0].startswith("STOP on the page")
     assert view._operator.velocity(time.monotonic()) is None
 
 

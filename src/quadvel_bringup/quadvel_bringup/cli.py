@@ -303,7 +303,8 @@ def up(
         ),
     ] = None,
     terrain: Annotated[
-        str | None, typer.Option(metavar="<name>", help="flat, slope or rough.", show_default="flat")
+        str | None,
+        typer.Option(metavar="<name>", help="flat, slope (10 degrees) or rough.", show_default="flat"),
     ] = None,
     world: Annotated[
         str | None,
@@ -489,7 +490,10 @@ def reset(
         Literal["flat", "slope", "rough"] | None,
         typer.Option(help="New ground.", show_default="the present ground"),
     ] = None,
-    slope: Annotated[float, typer.Option(help="With slope or rough: inclination, rad.")] = 0.0,
+    slope: Annotated[
+        float,
+        typer.Option(help="With slope or rough: inclination, rad.", show_default="slope 0.175, rough 0"),
+    ] = 0.0,
 ) -> None:
     """Reset the simulated robot to its start, or onto other ground.
 

@@ -57,6 +57,8 @@ class DriveRun:
         self._estimates = session.listen(TwistWithCovarianceStamped, "velocity_estimate", MAX_ESTIMATES)
         self._full_effect: float | None = None  # time since which the command is in full effect, s
         self._in_effect = np.zeros(3)
+        self._heard: deque[Any] | None = None  # velocities on the topic, own ones, too
+        self._rival = ""  # who else commands the robot
 
     def wait_for_robot(self) -> str:
         """Wait until the command mux listens and the robot stands.
@@ -102,10 +104,16 @@ class DriveRun:
 
     def send(self) -> None:
         """Publish the velocity, and check whether it is in full effect."""
+        if self._heard is None:  # from now on, as it is a subscriber itself
+            self._heard = self._session.listen(Twist, self._topic, keep=100)
         self._publisher.publish(_twist(self._asked))
         before, self._in_effect = self._in_effect, twist_to_array(self._states[-1].command)
         steady = np.abs(self._in_effect - before).max() < SAME_TOLERANCE
         followed = self._in_effect.any() == self._asked.any()
+        if any(np.abs(twist_to_array(twist) - self._asked).max() > SAME_TOLERANCE for twist in self._heard):
+            self._rival = f"another program that publishes {self._topic}, too,"
+        elif steady and self._commands and not self._is_part(self._in_effect):
+            self._rival = f"'{self._commands[-1].source}'"
         if self._full_effect is None and steady and followed:
             self._full_effect = time.monotonic()
             self._estimates.clear()
@@ -123,11 +131,12 @@ class DriveRun:
             The exit code: 1 if the robot followed another source.
         """
         print(f"commanded  {velocity_text(self._asked)}")
-        if np.abs(self._in_effect - self._asked).max() > SAME_TOLERANCE:
+        source = self._other_source()
+        if not source and np.abs(self._in_effect - self._asked).max() > SAME_TOLERANCE:
             ramping = "still ramping: the mux limits the acceleration"
             why = "clipped to the limits of mux and policy" if self._full_effect else ramping
             print(f"in effect  {velocity_text(self._in_effect)}, {why}")
-        if source := self._other_source():
+        if source:
             print(f"not followed: {source} commands the robot")
             return 1
         if self._full_effect and self._estimates:
@@ -137,10 +146,16 @@ class DriveRun:
             print("measured   nothing: too short to settle; drive for some seconds more")
         return 0
 
+    def _is_part(self, velocity: Array) -> bool:
+        """Whether a velocity (3,) can be what limits leave of the asked one."""
+        direction = np.where(self._asked < 0.0, -1.0, 1.0)
+        along, longest = direction * velocity, direction * self._asked
+        return bool(((along > -SAME_TOLERANCE) & (along < longest + SAME_TOLERANCE)).all())
+
     def _other_source(self) -> str:
-        """Return the source that commands the robot instead of this one, or ""."""
-        if not self._commands or not self._asked.any() or self._in_effect.any():
-            return ""
+        """Return the source that commands the robot, instead of this one or with it, or ""."""
+        if self._rival or not self._commands or not self._asked.any() or self._in_effect.any():
+            return self._rival
         return f"'{self._commands[-1].source}'"
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 
 import quadvel_dds
-from quadvel_recordings.output import output_file, output_folder
+from quadvel_recordings.output import output_folder, output_recording
 from quadvel_recordings.reading import DESCRIPTION_TOPIC
 
 from .exclusivity import ros_domain
@@ -38,12 +38,11 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
         Number of recorded messages.
 
     Raises:
+        ValueError: The suffix of the file is not .mcap.
         FileExistsError: The file exists already.
         OSError: The disk is full.
     """
-    if path.exists():
-        raise FileExistsError(f"{path} exists already; name another file")
-    output_file(path)
+    output_recording(path)
     quadvel_dds.install()
     from .recorder import Recorder
     from .recording_file import RecordingFile

@@ -201,7 +201,10 @@ def _equipment(nodes: Mapping[str, NodeReport]) -> Iterator[tuple[str, str]]:
     hottest = sorted(temperatures, key=lambda name: temperatures[name], reverse=True)[:3]
     listed = ", ".join(f"{name} {temperatures[name]}" for name in hottest)
     missing = "not reported: a simulated robot has none, a driver only with its robot"
-    yield "temperatures", f"{listed} degrees C, the hottest of {len(temperatures)}" if listed else missing
+    yield (
+        "temperatures",
+        f"{listed} degrees C, the hottest of {len(temperatures)} sensors" if listed else missing,
+    )
 
 
 def _measurements(states: deque[Any]) -> Iterator[tuple[str, str]]:

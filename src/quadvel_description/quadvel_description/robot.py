@@ -45,8 +45,8 @@ def load_robot(robot: str) -> Robot:
 
     Raises:
         FileNotFoundError: There is no such robot, or a file of its folder is missing.
-        ValueError: A file of its folder is wrong; the message names file, field, value found and
-            expectation.
+        ValueError: The path is another kind of file, or a file of its folder is wrong; the message names
+            file, field, value found and expectation.
     """
     path = Path(robot) if robot not in shipped_robots() else ROBOTS / robot
     file = path / "robot.yaml" if path.is_dir() else path
@@ -54,6 +54,11 @@ def load_robot(robot: str) -> Robot:
         names = ", ".join(shipped_robots())
         raise FileNotFoundError(
             f"robot: found {robot!r}, expected {names} or the path of a robot.yaml or of its folder"
+        )
+    if file.suffix not in (".yaml", ".yml"):
+        raise ValueError(
+            f"robot: found {robot!r}, expected a robot.yaml or its folder; `quadvel robot check` writes one "
+            "from an MJCF or URDF"
         )
     fields = read_document(file, "a YAML file of a robot", SCHEMA)
     if undecided := [name for name, value in fields.items() if value == UNDECIDED]:

@@ -177,7 +177,8 @@ class Driver(Node):
         self._lock.publish(Bool(data=False))
 
     def _request_mode(self, mode: str) -> None:
-        self._call(self._set_mode, SetMode.Request(mode=mode), mode)
+        requester = "the stop of the remote" if self._pilot.stopped else "the remote"
+        self._call(self._set_mode, SetMode.Request(mode=mode, requester=requester), mode)
 
     def _call(self, client: Any, request: Any, what: str) -> None:
         """Call a service of the controller and log the result."""

@@ -31,7 +31,7 @@ from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.flat_messages import Stamp, decode_low_cmd, decode_low_state, encode_estimate
 from quadvel_nodes.messages import MessageError, Refusals
-from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.node import create_only_publisher, read_parameters, run
 from quadvel_nodes.robot_check import RobotCheck
 from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transform_messages
 from quadvel_nodes.scheduling import Scheduling
@@ -106,7 +106,7 @@ class EstimatorNode(Node):
         self._reported = _ReportedCounts()
         self._count = 0
         self._busy_s = 0.0  # computing time of all estimates
-        self._velocity = self.create_publisher(TwistWithCovarianceStamped, "velocity_estimate", 10)
+        self._velocity = create_only_publisher(self, TwistWithCovarianceStamped, "velocity_estimate", 10)
         self._odom = self.create_publisher(Odometry, "odom", 10)
         self._tf = self.create_publisher(TFMessage, "/tf", 100)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)

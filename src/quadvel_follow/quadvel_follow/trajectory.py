@@ -244,7 +244,9 @@ def _load_csv(path: Path, speed: float) -> Trajectory:
         _check_leaps(numbers, _step_lengths(numbers))
         return Trajectory.from_points(numbers, speed)
     if (numbers[:, 0] <= 0.0).any():
-        raise ValueError("has seconds that are not above 0")
+        raise ValueError(
+            "seconds: found a duration that is not above 0, expected how long each velocity holds"
+        )
     return Trajectory.from_commands(numbers[:, 0], numbers[:, 1:])
 
 

@@ -32,7 +32,7 @@ from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_eval.report import read_json
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
-from quadvel_recordings.output import atomic_write, output_file
+from quadvel_recordings.output import atomic_write, output_recording
 from quadvel_recordings.reading import DESCRIPTION_TOPIC
 from quadvel_sysid.excitation import EXCITATIONS, PERIOD_S, Excitation, limit_torque, propose
 
@@ -236,9 +236,7 @@ def excite_command(
     chosen = load_robot(robot)
     excitation = EXCITATIONS[motion](chosen, **({} if seconds is None else {"seconds": seconds}))
     path = out or Path("out/excite") / f"{motion}.mcap"
-    if path.exists():
-        raise FileExistsError(f"{path} exists already; name another file with --out")
-    output_file(path)
+    output_recording(path)
     in_the_air = excitation.suspended if suspended is None else suspended
     parameters: dict[str, Any] = {"robot": absolute_file(robot), "hung": in_the_air, "seed": seed}
     if actuator is not None:

@@ -1,4 +1,4 @@
-"""Fault injection on the topics of a running robot, by a relay between its processes.
+"""Fault injection on the topics of a simulated robot, by a relay between its processes.
 
 `quadvel faults` injects faults into the classes from many seeds and measures reaction times. This
 module shows that the same faults arise from messages, and that the operator sees their names:
@@ -29,9 +29,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistWithCovarianceStamped
 from rclpy.qos import QoSProfile
 
+from quadvel_bringup.error_sentence import exit_with_sentence
 from quadvel_bringup.processes import ProcessGroup
 from quadvel_bringup.session import Session
 from quadvel_bringup.stack import Stack
+from quadvel_bringup.up import check_exclusive
 from quadvel_description.robot import Robot, load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand
@@ -598,10 +600,12 @@ def main(
         list[str], typer.Argument(callback=_known, help="Rows of docs/faults.md (default: all).")
     ] = [],  # noqa: B006 typer copies it
 ) -> None:
-    """Inject faults on the topics of a running robot, and print how each is reported.
+    """Start a simulated robot, inject faults on its topics, and print how each is reported.
 
-    Exit code 1 if a fault was not reported.
+    No other robot may run on this ROS domain. Exit code 1 if a fault was not reported.
     """
+    with exit_with_sentence("topic_faults"):
+        check_exclusive()
     wanted, missed = set(names), 0
     for low_level, faults in (("sim", FAULTS), ("board", BOARD_FAULTS)):
         chosen = [fault for fault in faults if not wanted or fault.name in wanted]

@@ -23,6 +23,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from .parameters import make_record, parameter_fields
+from .publishers import has_publisher
 from .topic_types import CHECK_PERIOD_S, ConflictWatch
 
 Config = TypeVar("Config")
@@ -72,6 +73,30 @@ def read_parameters(node: Node, config: type[Config]) -> Config:
         return make_record(config, values)
     except ValueError as error:
         raise StartError(f"parameters: {error.args[0]}") from error
+
+
+def create_only_publisher(node: Node, kind: Any, topic: str, depth: int, remedy: str = "") -> Any:
+    """Create the publisher of a topic that must have one alone.
+
+    Args:
+        node: The node.
+        kind: Type of the messages.
+        topic: Name of the topic, as for `Node.create_publisher`.
+        depth: Depth of its queue.
+        remedy: What else the operator may want, after a semicolon.
+
+    Returns:
+        The publisher.
+
+    Raises:
+        StartError: There is a publisher already.
+    """
+    if has_publisher(node, node.resolve_topic_name(topic)):
+        raise StartError(
+            f"{node.get_name()}: {topic} is already published, by another {node.get_name()} or one that was killed "
+            f"less than 10 s ago{remedy and '; '}{remedy}"
+        )
+    return node.create_publisher(kind, topic, depth)
 
 
 _exit_requests: dict[Node, str] = {}

@@ -17,8 +17,7 @@ from quadvel_description.fields import field
 from quadvel_msgs.msg import VelocityCommand
 from quadvel_nodes.diagnostics import diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, seconds
-from quadvel_nodes.node import StartError, read_parameters, run
-from quadvel_nodes.publishers import has_publisher
+from quadvel_nodes.node import create_only_publisher, read_parameters, run
 
 from .command_mux import CommandMux, MuxConfig, MuxInput, MuxOutput
 from .received import StampCheck, planar_velocity
@@ -87,21 +86,18 @@ class CommandMuxNode(Node):
         for topic in settings.lock_topics:
             self.create_subscription(Bool, topic, partial(self._on_lock, topic), 10)
         self.create_service(SetBool, "~/stance", self._on_stance)
-        self._command = self._only_publisher()
+        self._command = create_only_publisher(
+            self,
+            VelocityCommand,
+            COMMAND,
+            10,
+            "`quadvel up` starts a mux itself and takes its parameters from a file: --params FILE",
+        )
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # continues if the system clock is set back
         simulated = self.get_parameter("use_sim_time").value
         self.create_timer(PERIOD_S, self._update, clock=self.get_clock() if simulated else steady)
         self.create_timer(1.0, self._report, clock=steady)
-
-    def _only_publisher(self) -> Any:
-        """Create the publisher of `command`; StartError if there is one already."""
-        if has_publisher(self, self.resolve_topic_name(COMMAND)):
-            raise StartError(
-                f"command_mux: {COMMAND} is already published, by another command mux or one that was killed less "
-                "than 10 s ago; `quadvel up` starts a mux itself and takes its parameters from a file: --params FILE"
-            )
-        return self.create_publisher(VelocityCommand, COMMAND, 10)
 
     def _now(self) -> float:
         return float(1e-9 * self.get_clock().now().nanoseconds)

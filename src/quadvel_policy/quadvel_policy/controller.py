@@ -28,7 +28,7 @@ from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.flat_messages import decode_estimate, decode_low_state, encode_low_cmd
 from quadvel_nodes.messages import MessageError, Refusals, read_numbers, seconds
-from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.node import create_only_publisher, read_parameters, run
 from quadvel_nodes.number_text import counted, number_text
 from quadvel_nodes.robot_check import RobotCheck
 from quadvel_nodes.scheduling import Scheduling
@@ -94,7 +94,7 @@ class Controller(Node):
         gc.freeze()  # exclude existing objects from garbage collection, which would delay a tick
 
     def _create_interfaces(self) -> None:
-        self._low_cmd = self.create_publisher(LowCmd, "low_cmd", 1)
+        self._low_cmd = create_only_publisher(self, LowCmd, "low_cmd", 1)
         self._controller_state = self.create_publisher(ControllerState, "controller/state", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # Best effort suits a robot's driver; a simulator in lockstep waits for the answer to each state.
@@ -161,7 +161,7 @@ class Controller(Node):
         self._log_changes()
 
     def _on_set_mode(self, request: Any, response: Any) -> Any:
-        response.success, response.message = self._supervisor.request(request.mode)
+        response.success, response.message = self._supervisor.request(request.mode, request.requester)
         if not response.success:
             self.get_logger().warning(f"refused mode {request.mode}: {response.message}")
         self._log_changes()
@@ -249,11 +249,15 @@ class Controller(Node):
             log.warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
 
     def _duplicate_publisher(self) -> str | None:
-        """Return a sentence if more than one node publishes states, which fit no single robot, else None."""
-        count = self._states.get_publisher_count()
-        return (
-            f"low_state has {count} publishers, expected 1: stop the other simulator" if count > 1 else None
-        )
+        """Return a sentence if another node publishes states or joint commands, too, else None."""
+        counts = {
+            ("low_state", "simulator"): self._states.get_publisher_count(),
+            ("low_cmd", "controller"): self.count_publishers(self._low_cmd.topic_name),
+        }
+        for (topic, program), count in counts.items():
+            if count > 1:
+                return f"{topic} has {count} publishers, expected 1: stop the other {program}"
+        return None
 
     def _missing_state_text(self) -> str:
         refusal = self._loop.inputs.refused.get("low_state")

@@ -40,8 +40,8 @@ reason of the refusal. A simulated robot whose time stands still, because it is 
 this on the topic `waiting`; that is no fault.
 
 `python -m quadvel_policy.faults` prints this page. One test causes every row, and another one checks that the first
-test fails without the guard. `python -m quadvel_lab.topic_faults` causes the faults on the topics of a running
-robot. `make faults` makes sensors, links and processes of a simulated robot fail at random times, and measures the
+test fails without the guard. `python -m quadvel_lab.topic_faults` starts a simulated robot and causes the faults on its
+topics. `make faults` makes sensors, links and processes of a simulated robot fail at random times, and measures the
 [reaction times](results/faults.md).
 
 {tables}

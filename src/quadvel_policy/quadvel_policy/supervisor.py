@@ -176,7 +176,7 @@ class Supervisor:
         now.walking_enabled = enabled
         return True, "a command may start walking" if now.is_walking_allowed else "the robot stands still"
 
-    def request(self, mode: str) -> tuple[bool, str]:
+    def request(self, mode: str, requester: str = "") -> tuple[bool, str]:
         """Request a mode.
 
         "passive" is always accepted and clears a fault. "stance" clears the stop of a robot that
@@ -184,6 +184,7 @@ class Supervisor:
 
         Args:
             mode: One of MODES, except "fault".
+            requester: Who asks, for the reason.
 
         Returns:
             Whether the request was accepted, and a sentence.
@@ -194,11 +195,12 @@ class Supervisor:
         if refusal := request_refusal(mode, now):
             return False, refusal
         now.auto_stand = False
+        reason = f"requested by {requester}" if requester else "requested"
         if mode != now.mode:
-            self._switch(mode, "requested")
+            self._switch(mode, reason)
         elif mode == "stance" and now.latch.cause:
             now.latch.open()
-            now.reason, self.fault = "requested", ""
+            now.reason, self.fault = reason, ""
         return True, f"mode is {mode}"
 
     def fail(self, reason: str, fault: str) -> None:

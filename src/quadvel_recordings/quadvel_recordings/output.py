@@ -87,6 +87,26 @@ def output_file(path: Path) -> Path:
     return path
 
 
+def output_recording(path: Path) -> Path:
+    """Check that a new MCAP file can be written, without leaving a trace.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The same path.
+
+    Raises:
+        ValueError: Its suffix is another one: no command would read it.
+        OSError: The file exists, or is not writable; the message is one sentence.
+    """
+    if path.suffix != ".mcap":
+        raise ValueError(f"{path}: the suffix is '{path.suffix}', expected .mcap")
+    if path.exists():
+        raise FileExistsError(f"{path} exists already; name another file")
+    return output_file(path)
+
+
 def _check_writable(folder: Path, name: Path, requested: Path, kind: str) -> None:
     """Touch and delete a draft in `folder` or in its nearest existing parent.
 

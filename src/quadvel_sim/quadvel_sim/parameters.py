@@ -20,7 +20,7 @@ from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.loop import MODES, PublishState, ReportWaiting, SimulationLoop
 from quadvel_sim.simulator import Simulator
-from quadvel_sim.terrain import KINDS, Terrain
+from quadvel_sim.terrain import DEFAULT_SLOPE_RAD, KINDS, Terrain
 from quadvel_sim.world import SHIPPED_WORLDS, World
 
 _NOISE, _TERRAIN, _CONFIG = SensorNoise(), Terrain(), attrs.fields(SimulatorConfig)
@@ -46,7 +46,9 @@ class PlantParameters(Scheduling):
         "", f"world around the robot: a YAML file, or {', '.join(SHIPPED_WORLDS)}; empty: none"
     )
     terrain: str = field(_TERRAIN.kind, f"the ground: {', '.join(KINDS)}")
-    slope: float = field(_TERRAIN.slope, "inclination of the ground, rad, rising along x")
+    slope: float = field(
+        _TERRAIN.slope, f"inclination of the ground, rad, rising along x; 0 with slope: {DEFAULT_SLOPE_RAD}"
+    )
     roughness: float = field(_TERRAIN.roughness, "rough ground: bound of its heights, m")
     wavelength: float = field(_TERRAIN.wavelength, "rough ground: distance from hump to hollow, m")
     terrain_seed: int = field(_TERRAIN.seed, "rough ground: its seed")
@@ -126,7 +128,7 @@ class PlantParameters(Scheduling):
 
         Args:
             kind: `flat`, `slope` or `rough`.
-            slope: Inclination, rad.
+            slope: Inclination, rad; 0 with `slope`: `DEFAULT_SLOPE_RAD`.
 
         Returns:
             The terrain.
@@ -134,6 +136,8 @@ class PlantParameters(Scheduling):
         Raises:
             ValueError: The kind is unknown, or a number is out of its range.
         """
+        if kind == "slope":
+            slope = slope or DEFAULT_SLOPE_RAD
         return Terrain(kind, slope, self.roughness, self.wavelength, seed=self.terrain_seed)
 
     def _actuator(self, robot: Robot) -> ActuatorParameters:

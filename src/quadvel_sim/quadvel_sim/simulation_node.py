@@ -215,6 +215,10 @@ class SimulationNode(Node, ABC, Generic[Settings]):
     def _reset(self, keyframe: str, terrain: str, slope: float) -> None:
         """Reset the robot; a terrain name replaces the simulator."""
         if not terrain:
+            if slope:
+                raise ValueError(
+                    f"slope: found {slope:g} rad without a terrain, expected terrain slope or rough"
+                )
             self._loop.reset(keyframe)
             return
         ground = self._settings.make_terrain(terrain, slope)

@@ -56,6 +56,10 @@ def perlin(x: Array, y: Array, wavelength: float, seed: int) -> Array:
     return noise
 
 
+DEFAULT_SLOPE_RAD = 0.175
+"""Inclination of a slope for which none is given: 10 degrees."""
+
+
 @attrs.frozen
 class Terrain:
     """Ground z = x tan(slope) + noise(x, y) in the world frame; the noise is zero near the origin.

@@ -52,7 +52,11 @@ class FoxgloveServer:
                 name="quadvel", host=host, port=port, context=self._context, server_listener=_Latch(self)
             )
         except Exception as error:
-            advice = "; --port selects another one" if "in use" in str(error) else ""
+            advice = (
+                "; `quadvel view --foxglove --port NUMBER` takes another one"
+                if "in use" in str(error)
+                else ""
+            )
             raise AddressError(f"{host}:{port}: cannot serve the topics: {error}{advice}") from None
         self.url = f"ws://{host}:{self._server.port}"
 

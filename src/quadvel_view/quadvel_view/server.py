@@ -212,7 +212,7 @@ class PageServer:
         except (OSError, OverflowError, UnicodeError) as error:  # the latter two: invalid port or host name
             reason = getattr(error, "strerror", None) or error
             if getattr(error, "errno", None) == errno.EADDRINUSE:
-                reason = "another program uses this port; --port selects another one"
+                reason = "another program uses this port; `quadvel view --port NUMBER` takes another one"
             self._error = f"{self._host}:{self._port}: cannot serve the page: {reason}"
         finally:
             self._ready.set()

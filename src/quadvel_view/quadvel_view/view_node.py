@@ -42,8 +42,6 @@ LATEST_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 SIMULATOR_NODES = ("sim_node", "board")
 PUSH_FORCE_N, PUSH_DURATION_S = 60.0, 0.2
 """Force of the page's push, N."""
-SLOPE_RAD = 0.175
-"""Inclination of the terrain "slope" of the page."""
 
 
 @attrs.frozen
@@ -158,7 +156,10 @@ class View(Node):
     def _send_stop(self) -> None:
         """Request the passive mode."""
         self._stop_sent_at = time.monotonic()
-        self._call(self._set_mode, SetMode.Request(mode="passive"), "STOP")
+        request = SetMode.Request(
+            mode="passive", requester="STOP on the page, which holds until it is released there"
+        )
+        self._call(self._set_mode, request, "STOP")
 
     # Orders arrive in the server's thread. A timer of the executor executes them, because one task
     # for each order would delay timers and subscriptions for as long as orders arrive.
@@ -226,8 +227,7 @@ class View(Node):
 
         In other modes a jump in position is a fault.
         """
-        slope = SLOPE_RAD if terrain == "slope" else 0.0
-        request = ResetSim.Request(keyframe="lie", terrain=terrain, slope=slope)
+        request = ResetSim.Request(keyframe="lie", terrain=terrain)
 
         def put_back() -> None:
             self._call(_ready_client(self._resets), request, "reset", then=start_odometry)

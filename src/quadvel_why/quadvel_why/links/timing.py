@@ -131,7 +131,8 @@ class LostCommands(Cause):
     least = 0.015
     needs = ("torque",)
     remedy = (
-        "Count packets on both sides of the link; look for a full queue, a busy bus, or a second publisher"
+        "Count packets on both sides of the link; look for a full queue, a busy bus, or a second publisher. "
+        "A busy machine that simulates loses them, too"
     )
 
     @override

@@ -234,7 +234,11 @@ def opposite_signs(log: Log, found: Response) -> Iterator[Finding]:
     command_inverted, angle_inverted = found.command_correlation < 0.0, found.angle_correlation > 0.0
     cases = (
         ("q_des", command_inverted & ~angle_inverted, "{} answers its own command with the opposite sign"),
-        ("tau", command_inverted & angle_inverted, "has the opposite sign on {}; command and angle agree"),
+        (
+            "tau",
+            command_inverted & angle_inverted,
+            "has the opposite sign on {}, or q and q_des are exchanged there",
+        ),
         ("q", ~command_inverted & angle_inverted, "{} has the opposite sign of its command and its torque"),
     )
     for field, hit, text in cases:
