@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Iterator
@@ -38,6 +39,8 @@ def _sentence(error: Exception) -> str:
         return f"not enough memory on this machine: {error}"
     if isinstance(error, RecursionError):
         return f"the input is nested too deeply: {error}"
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
+        return "no space left on the disk of the output"
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
     return " ".join(str(error).split())
