@@ -19,8 +19,8 @@ import numpy as np
 from .similarity import REFERENCE, Size
 
 FOOT_PHASES = np.array([0.0, 0.5, 0.5, 0.0])  # cycles, in the order of quadruped.LEGS: FR with RL, FL with RR
-FREQUENCY = (1.9, 0.655, 4.4)  # Hz at rest, increase in Hz per m/s, highest Hz
-DUTY = (0.75, 0.086, 0.36)  # share of a cycle on the ground at rest, decrease per m/s, least
+FREQUENCY = (2.0, 0.95, 4.4)  # Hz at rest, increase in Hz per m/s, highest Hz
+DUTY = (0.75, 0.0914, 0.349)  # share of a cycle on the ground at rest, decrease per m/s, least
 START_PHASE = 0.6  # cycles since touchdown of the pair FR and RL in stance: it lifts off first
 CORRECTION = 0.25  # of a touchdown's phase error; the two feet of a pair correct half of it
 SHORTEST_SWING_S = 0.06  # a foot that was in the air for less has not stepped

@@ -3,7 +3,7 @@
 Feet follow the gait clock: swings rise and return, stances sweep at the planned velocity. Feedbacks
 of the true state keep robots on their feet: feet are placed by the excess velocity and by the way
 that the robot lags behind, the trunk is levelled and kept at its height, feet turn against a wrong
-yaw rate. In curves the feet are placed further out. The gains were found by a search over walks of
+yaw rate. The gains were found by a search over walks of
 robots drawn as in training, with a trained correction. Lengths, times and speeds hold for a robot
 of the reference size; those of others follow by `similarity`.
 """
@@ -13,34 +13,29 @@ from __future__ import annotations
 import numpy as np
 
 from quadvel_description.kinematics import foot_positions, inverse_kinematics
-from quadvel_description.quadruped import GRAVITY
 
 from .env import VelocityEnv
 from .gait_clock import GaitClock
 
-HEIGHT_M = 0.37  # of the trunk above ground
-CROUCH_M = 0.032  # by which the trunk is lower than in the nominal posture: longer steps are in reach
-LIFT_M = 0.104  # height of a swing
-LONGEST_STEP_M = 0.198  # way of a foot under the trunk in one stance
-LEAD_S = 0.077  # joints follow their targets so late, whatever the size
-PLACEMENT_S = np.array([0.085, 0.064])  # x, y: feet are placed this time times the excess velocity out,
-BEHIND_S = np.array([0.062, 0.034])  # this time times the planned velocity behind, which drives,
-DRAG = np.array([0.0055, 0.0])  # s^2/m, this times its square behind, as steps lose speed,
-CATCH_UP = 0.1  # and this share of the way that the robot lags behind its command
-MAX_BEHIND = np.array([0.45, 2.0])  # m/s, planned velocity that counts
+HEIGHT_M = 0.358  # of the trunk above ground
+CROUCH_M = 0.014  # by which the trunk is lower than in the nominal posture: longer steps are in reach
+LIFT_M = 0.099  # height of a swing
+LONGEST_STEP_M = 0.108  # way of a foot under the trunk in one stance
+LEAD_S = 0.05  # joints follow their targets so late, whatever the size
+PLACEMENT_S = np.array([0.103, 0.073])  # x, y: feet are placed this time times the excess velocity out,
+CATCH_UP = 0.13  # and this share of the way that the robot lags behind its command behind
+BEHIND_S = np.array([0.092, 0.037])  # targets of stance feet are this time times the planned velocity behind,
+DRAG = np.array([0.0105, 0.0])  # s^2/m, and this times its square: joints push the trunk forward
+MAX_BEHIND = np.array([0.46, 2.0])  # m/s, planned velocity that counts
 MAX_EXCESS = 0.5  # m/s, excess velocity that counts
-CURVE = 0.87  # share of the acceleration in a curve for which feet are placed out
-YAW_GAIN = 0.52  # stances turn faster by this share of the excess yaw rate,
-TURN_S = 0.031  # and feet are turned about the trunk by this time times it
+TURN_S = 0.064  # feet are turned about the trunk by this time times the excess yaw rate
 MAX_YAW_EXCESS = 1.5  # rad/s, excess yaw rate that counts
-LEVELLING = np.array([1.2, 1.88])  # roll, pitch: share of the tilt that stance feet push back
-RATE_S = np.array([0.025, 0.08])  # time that a roll or pitch rate is extrapolated
-HEIGHT_GAIN = 0.54  # share of the height above HEIGHT_M by which stance feet of a walk give way,
+LEVELLING = np.array([1.68, 0.87])  # roll, pitch: share of the tilt that stance feet push back
+RATE_S = np.array([0.068, 0.112])  # time that a roll or pitch rate is extrapolated
+HEIGHT_GAIN = 0.37  # share of the height above HEIGHT_M by which stance feet of a walk give way,
 MAX_HEIGHT_ERROR_M = 0.1  # up to this error
-LOAD = 1.7  # share of the load of a stance foot that is fed forward
-LOADING = (
-    0.08  # cycles in which a stance gains and loses its load, half of them before touchdown and lift-off
-)
+LOAD = 1.51  # share of the load of a stance foot that is fed forward
+LOADING = 0.16  # cycles in which a stance gains or loses load and push, half before touchdown or lift-off
 
 
 def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.ndarray:
@@ -66,26 +61,23 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.nda
     loaded = np.where(clock.walking[:, None], _load(phases, duty), 1.0)
     excess = np.clip(velocity[:, :2] - planned[:, :2], -MAX_EXCESS, MAX_EXCESS)
     turning = np.clip(velocity[:, 2] - planned[:, 2], -MAX_YAW_EXCESS, MAX_YAW_EXCESS)
-    # way of a foot at (x, y) in a stance of duty / f: (vx - w y, vy + w x) duty / f,
-    # w = w_planned - YAW_GAIN (w_z - w_planned)
-    sweep = planned - [0.0, 0.0, YAW_GAIN] * turning[:, None]
-    way = (sweep[:, None, :2] + _turned(below, sweep[:, 2])) * (duty / frequency)[
-        :, None, None
-    ]  # (n, 4, 2), m
+    # way of a foot at (x, y) in a stance of duty / f: (vx - w y, vy + w x) duty / f, (n, 4, 2), m
+    way = (planned[:, None, :2] + _turned(below, planned[:, 2])) * (duty / frequency)[:, None, None]
     way *= np.minimum(1.0, LONGEST_STEP_M / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
     # place on the way, from 1 to -1 in stance and back in swing: 1 - 2 phase / duty, -cos(pi s)
     along = np.where(down, 1.0 - 2.0 * phases / duty[:, None], -np.cos(np.pi * swing))
     along *= clock.walking[:, None]
-    # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_planned) - BEHIND_S clip(v_planned)
-    #     - DRAG |v_planned| v_planned - CATCH_UP lag - CURVE (h / g) w x v_planned
+    # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_planned) - CATCH_UP lag
     #     + TURN_S (w_z - w_planned) x (x_nominal)
-    # A trunk at height h above feet that are a distance d aside accelerates by g d / h.
-    placed = PLACEMENT_S * excess - BEHIND_S * np.clip(planned[:, :2], -MAX_BEHIND, MAX_BEHIND)
-    placed -= DRAG * np.abs(planned[:, :2]) * planned[:, :2]
-    placed -= CATCH_UP * lag / size.length * clock.walking[:, None]
-    placed -= CURVE * HEIGHT_M / GRAVITY * _turned(planned[:, None, :2], planned[:, 2])[:, 0]
+    #     - loaded (BEHIND_S clip(v_planned) + DRAG |v_planned| v_planned)
+    # A trunk at height h above feet that are a distance d aside accelerates by g d / h. The last
+    # term acts in stance alone: feet land under the hip, and joints push the trunk forward.
+    placed = PLACEMENT_S * excess - CATCH_UP * lag / size.length * clock.walking[:, None]
+    behind = BEHIND_S * np.clip(planned[:, :2], -MAX_BEHIND, MAX_BEHIND)
+    behind = behind + DRAG * np.abs(planned[:, :2]) * planned[:, :2]
     feet = np.broadcast_to(below, (len(planned), 4, 3)).copy()
     feet[..., :2] += 0.5 * way * along[..., None] + placed[:, None, :] + _turned(below, TURN_S * turning)
+    feet[..., :2] -= loaded[..., None] * behind[:, None, :]
     # z_foot = z_nominal + LIFT_M sin^2(pi s); a stance foot on the lower side of the trunk pushes
     # down: z_foot += y roll - x pitch, both extrapolated by RATE_S, times LEVELLING; while walking,
     # z_foot += HEIGHT_GAIN (h - HEIGHT_M)
