@@ -23,6 +23,7 @@ from quadvel_description.kinematics import foot_positions
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator import estimator, features
 from quadvel_msgs.msg import LowCmd, LowState
+from quadvel_nodes import publishers
 from quadvel_nodes.messages import write_low_cmd, write_low_state
 from quadvel_nodes.node import StartError
 from tests.helpers.robots import ALIENGO
@@ -83,10 +84,15 @@ class Bench:
 
 @pytest.fixture
 def bench(
-    request: pytest.FixtureRequest, write_estimator: Callable[..., Path], standing: State
+    request: pytest.FixtureRequest,
+    write_estimator: Callable[..., Path],
+    standing: State,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Bench]:
     arguments = getattr(request, "param", ["-p", f"model:={write_estimator()}"])
-    bench = Bench(arguments, standing)
+    with monkeypatch.context() as alone:
+        alone.setattr(publishers, "DISCOVERY_TIME_S", 0.0)  # the node is the first
+        bench = Bench(arguments, standing)
     yield bench
     bench.close()
 

@@ -16,6 +16,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 import quadvel_dds
+from quadvel_nodes import publishers
 from quadvel_policy.observation import PolicyMetadata, default_observation
 from tests.helpers.robots import ALIENGO
 
@@ -238,12 +239,14 @@ class Graph:
 
 
 @pytest.fixture
-def graph() -> Iterator[Callable[..., Graph]]:
-    """graph(NodeClass, *ROS arguments) -> Graph."""
+def graph(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Graph]]:
+    """graph(NodeClass, *ROS arguments) -> Graph; the node does not wait for others, as it is the first."""
     graphs: list[Graph] = []
 
     def start(make_node: Callable[[], Any], *arguments: str) -> Graph:
-        graphs.append(Graph(make_node, *arguments))
+        with monkeypatch.context() as alone:
+            alone.setattr(publishers, "DISCOVERY_TIME_S", 0.0)
+            graphs.append(Graph(make_node, *arguments))
         return graphs[-1]
 
     yield start
