@@ -179,6 +179,14 @@ def test_a_robot_that_lags_behind_places_its_feet_behind_and_one_that_drifts_asi
     assert moved[:, :2] == pytest.approx(np.tile([-0.026, 0.026], (4, 1)), abs=2e-3)
 
 
+def test_in_a_curve_the_feet_are_placed_out_by_what_the_centripetal_acceleration_takes(weightless):
+    env = VelocityEnv(CALM)
+    left, right = (walking_feet(env, [1.5, 0.0, turn], [0.0, 0.0]) for turn in (1.0, -1.0))
+    # a trunk at height h accelerates by g d / h towards the side from which its feet are d away
+    out = 0.87 * 1.5 * 1.0 * 0.358 / 9.81
+    assert (right - left)[:, 1].mean() == pytest.approx(2 * out, rel=0.05)
+
+
 def test_feet_that_stand_push_back_and_those_that_swing_do_not(weightless, monkeypatch):
     env = VelocityEnv(CALM)
     pushing = walking_feet(env, [2.0, 0.0, 0.0], [0.0, 0.0])

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from quadvel_description.kinematics import foot_positions, inverse_kinematics
+from quadvel_description.quadruped import GRAVITY
 
 from .env import VelocityEnv
 from .gait_clock import GaitClock
@@ -28,6 +29,7 @@ BEHIND_S = np.array([0.092, 0.037])  # targets of stance feet are this time time
 DRAG = np.array([0.0105, 0.0])  # s^2/m, and this times its square: joints push the trunk forward
 MAX_BEHIND = np.array([0.46, 2.0])  # m/s, planned velocity that counts
 MAX_EXCESS = 0.5  # m/s, excess velocity that counts
+CURVE = 0.87  # share of the acceleration in a curve for which feet are placed out
 TURN_S = 0.064  # feet are turned about the trunk by this time times the excess yaw rate
 MAX_YAW_EXCESS = 1.5  # rad/s, excess yaw rate that counts
 LEVELLING = np.array([1.68, 0.87])  # roll, pitch: share of the tilt that stance feet push back
@@ -68,11 +70,12 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.nda
     along = np.where(down, 1.0 - 2.0 * phases / duty[:, None], -np.cos(np.pi * swing))
     along *= clock.walking[:, None]
     # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_planned) - CATCH_UP lag
-    #     + TURN_S (w_z - w_planned) x (x_nominal)
+    #     - CURVE (h / g) w x v_planned + TURN_S (w_z - w_planned) x (x_nominal)
     #     - loaded (BEHIND_S clip(v_planned) + DRAG |v_planned| v_planned)
     # A trunk at height h above feet that are a distance d aside accelerates by g d / h. The last
     # term acts in stance alone: feet land under the hip, and joints push the trunk forward.
     placed = PLACEMENT_S * excess - CATCH_UP * lag / size.length * clock.walking[:, None]
+    placed -= CURVE * HEIGHT_M / GRAVITY * _turned(planned[:, None, :2], planned[:, 2])[:, 0]
     behind = BEHIND_S * np.clip(planned[:, :2], -MAX_BEHIND, MAX_BEHIND)
     behind = behind + DRAG * np.abs(planned[:, :2]) * planned[:, :2]
     feet = np.broadcast_to(below, (len(planned), 4, 3)).copy()
