@@ -99,6 +99,12 @@ def test_a_wrong_call_ends_in_one_sentence_and_exit_code_2(arguments: list[str],
     assert "Traceback" not in result.stderr
 
 
+def test_a_topic_that_is_no_name_is_refused_in_one_sentence() -> None:
+    result = quadvel("drive", "--vx", "0.4", "--topic", "bad topic")
+    assert result.returncode == 2
+    assert result.stderr.startswith("quadvel: --topic: ")
+
+
 @pytest.mark.parametrize("command", [["record"], ["excite", "chirp"]])
 def test_a_recording_has_the_suffix_by_which_it_is_read(command: list[str], tmp_path: Path) -> None:
     result = quadvel(*command, "--out", str(tmp_path / "walk.txt"))

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from quadvel_description.quadruped import JOINT_NAMES, joint_index
-from quadvel_description.robot import load_robot
+from quadvel_description.robot import load_robot, robot_of_file
 from tests.helpers.robots import ALIENGO, GO2
 
 # mass (kg), centre of mass (m) and inertia (ixx iyy izz ixy ixz iyz, kg mm^2), worked out apart
@@ -104,3 +104,9 @@ def test_a_robot_is_loaded_by_name_or_folder(tmp_path):
         load_robot("spot")
     with pytest.raises(ValueError, match=r"expected a robot\.yaml or its folder; `quadvel robot check`"):
         load_robot(str(Path(GO2.folder) / "robot.urdf"))
+
+
+def test_a_file_of_a_robot_that_is_not_shipped_asks_for_its_folder(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"walk\.mcap: its robot is 'mine', .*--robot"):
+        robot_of_file(tmp_path / "walk.mcap", "mine", None)
+    assert robot_of_file(tmp_path / "walk.mcap", "go2", GO2.folder) is not None

@@ -50,6 +50,18 @@ def test_a_refusal_is_one_sentence_and_writes_nothing(
     assert not out.exists()
 
 
+@pytest.mark.parametrize("again", [[], ["--holdout"]])
+def test_a_log_that_is_fitted_is_not_held_out_as_well(
+    again: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = str(npz(tmp_path / "log.npz"))
+    monkeypatch.setattr(sys, "argv", ["identify", log, *again, log, "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 2
+    assert "log.npz: named twice" in capsys.readouterr().err
+
+
 def test_recordings_are_read_where_no_middleware_is_installed(tmp_path: Path) -> None:
     recording = mcap(tmp_path / "walk.mcap", fields() | {"dq": -fields()["dq"]})
     program = (

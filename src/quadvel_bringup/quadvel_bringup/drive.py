@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import Twist, TwistWithCovarianceStamped
 from numpy.typing import ArrayLike
+from rclpy.exceptions import NameValidationException
 
 from quadvel_description.arrays import Array
 from quadvel_msgs.msg import ControllerState, VelocityCommand
@@ -173,13 +174,16 @@ def drive(vx: float, vy: float, wz: float, seconds: float, topic: str) -> int:
         The exit code: 1 if the robot did not follow.
 
     Raises:
-        ValueError: An argument is not finite.
+        ValueError: A velocity is not finite, or the topic is no valid name.
     """
     for name, value in {"--vx": vx, "--vy": vy, "--wz": wz, "--seconds": seconds}.items():
         if not math.isfinite(value):
             raise ValueError(f"{name} is {value}, expected a finite number")
     with StopSignals() as signals, Session("drive") as session:
-        robot = DriveRun(session, signals, (vx, vy, wz), topic)
+        try:
+            robot = DriveRun(session, signals, (vx, vy, wz), topic)
+        except NameValidationException as error:
+            raise ValueError(f"--topic: {error}") from None
         refusal = robot.wait_for_robot()
         if signals.received:
             return 0

@@ -95,6 +95,10 @@ def robot_of_file(path: Path, named: str | None, asked: str | None) -> Robot:
         FileNotFoundError: There is no such robot.
     """
     if asked is None:
+        if named and named not in shipped_robots():
+            raise FileNotFoundError(
+                f"{path}: its robot is {named!r}, which is not shipped: name its folder by --robot"
+            )
         return load_robot(named or UNNAMED_ROBOT)
     robot = load_robot(asked)
     if named not in (None, robot.name):

@@ -143,4 +143,8 @@ def generate_folder_urdf(folder: Path) -> str:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2 or not (Path(sys.argv[1]) / "robot.yaml").is_file():
+        sys.exit(
+            "usage: python -m quadvel_description.urdf_generator FOLDER, with robot.xml and robot.yaml in it"
+        )
     (Path(sys.argv[1]) / "robot.urdf").write_text(generate_folder_urdf(Path(sys.argv[1])), encoding="utf-8")

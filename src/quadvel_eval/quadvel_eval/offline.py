@@ -254,9 +254,13 @@ def replay_command(
     To see a recording in 3-D: quadvel view walk.mcap
     """
     output_folder(out)
+    if estimator != "learned" and estimator_file is not None:
+        raise ValueError(
+            f"--estimator-file: found {estimator_file} with --estimator {estimator}, expected learned"
+        )
     if robot is not None:
         load_robot(robot)  # a wrong one is refused before the recording is read
-    run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording))
+    run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording), robot)
     chosen = robot_of_file(recording, None if run.robot is None else run.robot.name, robot)
     model = ActuatorParameters.of(chosen) if actuator is None else ActuatorParameters.load(chosen, actuator)
     asked = LearnedEstimator(chosen, estimator_file) if estimator == "learned" else KalmanEstimator(chosen)

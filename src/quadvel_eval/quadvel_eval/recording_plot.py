@@ -20,7 +20,7 @@ from matplotlib.patches import Patch
 
 from quadvel_description.arrays import Array
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import Robot, robot_of_file
+from quadvel_description.robot import Robot, load_robot, robot_of_file
 from quadvel_description.robot_name import described_robot
 from quadvel_recordings.joint_log import JointLog, read_joint_log
 from quadvel_recordings.output import atomic_write, output_folder
@@ -123,6 +123,7 @@ def read_recorded_run(
     state_topic: str | None = None,
     command_topic: str | None = None,
     warn: Callable[[str], None] | None = None,
+    asked: str | None = None,
 ) -> RecordedRun:
     """Read a recording of this stack, or of the joints of any robot.
 
@@ -131,6 +132,7 @@ def read_recorded_run(
         state_topic: Topic of the joint states, if it is not low_state.
         command_topic: Topic of the joint commands, if it is not low_cmd.
         warn: Called with one sentence for each assumption.
+        asked: Name or folder of the robot; None: that of the recording.
 
     Returns:
         The series of the run.
@@ -157,7 +159,7 @@ def read_recorded_run(
     ends = max(float(times[-1]) for times, _ in lines.values())
     if foreign:
         return RecordedRun(begin, lines, modes, ends, foreign.state.joints, received, foreign)
-    robot = robot_of_file(path, described_robot(recorded_description(path)), None)
+    robot = robot_of_file(path, described_robot(recorded_description(path)), asked)
     return RecordedRun(begin, lines, modes, ends, JOINT_NAMES, received, None, robot)
 
 
@@ -396,6 +398,14 @@ def plot_command(
     out: Annotated[Path, typer.Option(metavar="<folder>", help="Folder for the pictures.")] = Path(
         "out/plot"
     ),
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            metavar="<name|file>",
+            help="The robot: aliengo, go2 or the folder of a robot.",
+            show_default="as recorded, or aliengo",
+        ),
+    ] = None,
     state_topic: StateTopicOption = None,
     command_topic: CommandTopicOption = None,
 ) -> None:
@@ -405,7 +415,9 @@ def plot_command(
     LowCmd. Colours show the controller's mode.
     """
     output_folder(out)
-    run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording))
+    if robot is not None:
+        load_robot(robot)  # a wrong one is refused before the recording is read
+    run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording), robot)
     for name, draw in FIGURES.items():
         figure = draw(run)
         if figure is None:

@@ -249,15 +249,11 @@ class Controller(Node):
             log.warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
 
     def _duplicate_publisher(self) -> str | None:
-        """Return a sentence if another node publishes states or joint commands, too, else None."""
-        counts = {
-            ("low_state", "simulator"): self._states.get_publisher_count(),
-            ("low_cmd", "controller"): self.count_publishers(self._low_cmd.topic_name),
-        }
-        for (topic, program), count in counts.items():
-            if count > 1:
-                return f"{topic} has {count} publishers, expected 1: stop the other {program}"
-        return None
+        """Return a sentence if more than one node publishes states, which fit no single robot, else None."""
+        count = self._states.get_publisher_count()
+        return (
+            f"low_state has {count} publishers, expected 1: stop the other simulator" if count > 1 else None
+        )
 
     def _missing_state_text(self) -> str:
         refusal = self._loop.inputs.refused.get("low_state")
@@ -279,6 +275,9 @@ class Controller(Node):
             return DiagnosticStatus.ERROR, self._loop.inputs.duplicate_publisher
         if self._loop.inputs.state is None:
             return DiagnosticStatus.WARN, f"{self._missing_state_text()} yet"
+        writers = self.count_publishers(self._low_cmd.topic_name)
+        if writers > 1:  # no fault: one that only exists disturbs nobody
+            return DiagnosticStatus.WARN, f"low_cmd has {writers} publishers, expected 1; {status}"
         if self._supervisor.findings:
             return DiagnosticStatus.WARN, f"{self._supervisor.findings[0].sentence}; {status}"
         if refused:

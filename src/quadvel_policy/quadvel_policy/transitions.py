@@ -289,7 +289,7 @@ def walk_refusal(now: Situation) -> str:
     if now.mode == "fault":
         return "the robot is in fault: request passive, then stand_up"
     if now.mode not in VELOCITY_MODES:
-        return f"the robot is in mode {now.mode}, expected {' or '.join(VELOCITY_MODES)}"
+        return f"the robot is in mode {now.mode} ({now.reason}), expected {' or '.join(VELOCITY_MODES)}"
     return _first_refusal(
         (_require_policy, _require_no_stop, _require_permission_to_walk, _require_zero_command_seen), now
     )

@@ -177,6 +177,9 @@ def identify(
     messages = Console(stderr=True)
     try:
         output_folder(out)
+        named = [path.resolve() for path in (*logs, *(holdout or []))]
+        if twice := [path for path in named if named.count(path) > 1]:
+            raise ValueError(f"{twice[0]}: named twice, expected each log once, for the fit or held out")
         return_freed_arrays_to_system()
         names = ColumnMap() if columns is None else ColumnMap.load(columns)
         kind = robot if robot is not None and is_robot(robot) else None

@@ -123,7 +123,15 @@ def _answer(run: Run, recording: Path, policy: Path | None, out: Path) -> bool:
     Returns:
         Whether a link breaks.
     """
-    driver = chosen_policy(run.robot, str(policy or "")) if policy is not None or run.is_own else None
+    try:
+        driver = chosen_policy(run.robot, str(policy or "")) if policy is not None or run.is_own else None
+    except FileNotFoundError as error:
+        if policy is not None:
+            raise
+        hint = "name the policy that drove by --policy FILE, or none"
+        raise FileNotFoundError(
+            f"{recording}: no policy is shipped for its robot {run.robot.name!r}: {hint}"
+        ) from error
     for remark in run.remarks:
         typer.echo(f"quadvel: warning: {recording}: {remark}", err=True)
     if isinstance(driver, ImportedPolicy):
