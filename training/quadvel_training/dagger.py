@@ -454,8 +454,7 @@ class DaggerRun:
             for values, value in zip(rows.values(), seen, strict=True):
                 values.append(value)
             standing.append(self._stands())
-            command = self.env.command.copy()
-            self._tick(obs, advice)
+            command = self._tick(obs, advice)
             drift.advance(velocity_error(self.env, command), self._steady(command), self.env.changed)
             fell |= self.env.fallen & alive
             alive &= ~(self.env.fallen | self.env.timed_out)
@@ -470,12 +469,15 @@ class DaggerRun:
         stood = torch.from_numpy(np.array(standing, dtype=np.float32))
         return Experience(**tensors), stood, figures
 
-    def _tick(self, obs: np.ndarray, advice: np.ndarray) -> None:
+    def _tick(self, obs: np.ndarray, advice: np.ndarray) -> np.ndarray:
         """Advance the robots by a tick, each with its driver's action and its exploration.
 
         Args:
             obs: (n, 48), observations of the student.
             advice: (n, 12), actions of the teacher, in the network's unit.
+
+        Returns:
+            (n, 4), command that was in force.
         """
         env, c = self.env, self.config
         # Ornstein-Uhlenbeck noise: n <- d n + noise sqrt(1 - d^2) w, d = exp(-dt / noise_time)
@@ -488,6 +490,7 @@ class DaggerRun:
         command = env.command.copy()
         env.tick(self.map.targets(self._previous))
         self.teacher.advance(command, self._previous)
+        return command
 
     def _stands(self) -> np.ndarray:
         """Whether robots (n,) stand, or have not lifted a foot since they stood."""

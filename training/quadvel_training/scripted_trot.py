@@ -3,9 +3,9 @@
 Feet follow the gait clock: swings rise and return, stances sweep at the planned velocity. Feedbacks
 of the true state keep robots on their feet: feet are placed by the excess velocity and by the way
 that the robot lags behind, the trunk is levelled and kept at its height, feet turn against a wrong
-yaw rate. The gains were found by a search over walks of
-robots drawn as in training, with a trained correction. Lengths, times and speeds hold for a robot
-of the reference size; those of others follow by `similarity`.
+yaw rate. In curves the feet are placed further out. The gains were found by a search over walks of
+robots drawn as in training, without a network. Lengths, times and speeds hold for a robot of the
+reference size; those of others follow by `similarity`.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.nda
     #     - CURVE (h / g) w x v_planned + TURN_S (w_z - w_planned) x (x_nominal)
     #     - loaded (BEHIND_S clip(v_planned) + DRAG |v_planned| v_planned)
     # A trunk at height h above feet that are a distance d aside accelerates by g d / h. The last
-    # term acts in stance alone: feet land under the hip, and joints push the trunk forward.
+    # term acts in stance alone: joints push the trunk forward, and swings end further ahead.
     placed = PLACEMENT_S * excess - CATCH_UP * lag / size.length * clock.walking[:, None]
     placed -= CURVE * HEIGHT_M / GRAVITY * _turned(planned[:, None, :2], planned[:, 2])[:, 0]
     behind = BEHIND_S * np.clip(planned[:, :2], -MAX_BEHIND, MAX_BEHIND)

@@ -21,7 +21,7 @@ from rich.table import Table
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.arrays import Array
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import Robot, load_robot, robot_of_file
+from quadvel_description.robot import Robot, robot_of_file
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import LearnedEstimator
@@ -37,6 +37,7 @@ from .recording_plot import (
     CommandTopicOption,
     RecordedRun,
     RecordingArgument,
+    RobotOption,
     StateTopicOption,
     add_legend,
     read_recorded_run,
@@ -233,14 +234,7 @@ def replay_command(
             show_default="none",
         ),
     ] = None,
-    robot: Annotated[
-        str | None,
-        typer.Option(
-            metavar="<name|file>",
-            help="The robot: aliengo, go2 or the folder of a robot.",
-            show_default="as recorded",
-        ),
-    ] = None,
+    robot: RobotOption = None,
     state_topic: StateTopicOption = None,
     command_topic: CommandTopicOption = None,
 ) -> None:
@@ -258,8 +252,6 @@ def replay_command(
         raise ValueError(
             f"--estimator-file: found {estimator_file} with --estimator {estimator}, expected learned"
         )
-    if robot is not None:
-        load_robot(robot)  # a wrong one is refused before the recording is read
     run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording), robot)
     chosen = robot_of_file(recording, None if run.robot is None else run.robot.name, robot)
     model = ActuatorParameters.of(chosen) if actuator is None else ActuatorParameters.load(chosen, actuator)

@@ -140,6 +140,8 @@ def read_recorded_run(
     Raises:
         RecordingError: The recording holds nothing to plot; the message names its topics.
     """
+    if asked is not None:
+        load_robot(asked)  # a wrong one is refused before the recording is read
     rows = _read_topics(path, warn)
     missing = missing_stamp_notices({topic: np.array(found.stamps) for topic, found in rows.items()})
     if warn:
@@ -369,6 +371,14 @@ def _mode_colour(mode: str) -> str:
 RecordingArgument = Annotated[
     Path, typer.Argument(help="An MCAP file, a rosbag2 folder or a bag of ROS 1.", show_default=False)
 ]
+RobotOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="<name|file>",
+        help="The robot: aliengo, go2 or the folder of a robot.",
+        show_default="as recorded, or aliengo",
+    ),
+]
 StateTopicOption = Annotated[
     str | None,
     typer.Option(metavar="<topic>", help="Topic of the joint states.", show_default="found by type"),
@@ -398,14 +408,7 @@ def plot_command(
     out: Annotated[Path, typer.Option(metavar="<folder>", help="Folder for the pictures.")] = Path(
         "out/plot"
     ),
-    robot: Annotated[
-        str | None,
-        typer.Option(
-            metavar="<name|file>",
-            help="The robot: aliengo, go2 or the folder of a robot.",
-            show_default="as recorded, or aliengo",
-        ),
-    ] = None,
+    robot: RobotOption = None,
     state_topic: StateTopicOption = None,
     command_topic: CommandTopicOption = None,
 ) -> None:
@@ -415,8 +418,6 @@ def plot_command(
     LowCmd. Colours show the controller's mode.
     """
     output_folder(out)
-    if robot is not None:
-        load_robot(robot)  # a wrong one is refused before the recording is read
     run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording), robot)
     for name, draw in FIGURES.items():
         figure = draw(run)

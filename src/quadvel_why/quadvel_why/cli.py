@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from quadvel_eval.recording_plot import CommandTopicOption, StateTopicOption
+from quadvel_eval.recording_plot import CommandTopicOption, RobotOption, StateTopicOption
 from quadvel_policy.imported.policy import ImportedPolicy
 from quadvel_policy.policy_file import chosen_policy
 from quadvel_recordings.output import atomic_write, output_folder
@@ -45,14 +45,7 @@ def why_command(
             show_default="the shipped one, for a recording of this stack",
         ),
     ] = None,
-    robot: Annotated[
-        str | None,
-        typer.Option(
-            metavar="<name|file>",
-            help="The robot: aliengo, go2 or the folder of a robot.",
-            show_default="as recorded, or aliengo",
-        ),
-    ] = None,
+    robot: RobotOption = None,
     gains: Annotated[
         tuple[float, float] | None,
         typer.Option(
