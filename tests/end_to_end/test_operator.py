@@ -177,7 +177,9 @@ def test_drive_refuses_what_is_no_number() -> None:
 def test_drive_says_that_nobody_listens(up: Robot) -> None:
     code, text = quadvel("drive", "--vx", "0.2", "--topic", "cmd_vel_of_nobody")
     assert code == 2
-    assert text.startswith("quadvel: cmd_vel_of_nobody: no subscriber; start the robot first: quadvel up")
+    assert text.startswith(
+        "quadvel: cmd_vel_of_nobody: no subscriber for velocities, which are taken on /cmd_vel,"
+    )
 
 
 def test_status_shows_nodes_mode_rates_and_files_on_one_page(up: Robot) -> None:

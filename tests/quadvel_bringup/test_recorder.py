@@ -209,6 +209,19 @@ def test_a_recording_on_which_nothing_came_leaves_no_file(tmp_path: Path) -> Non
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_duration_of_a_recording_starts_with_its_first_message(node: Node, tmp_path: Path) -> None:
+    path = tmp_path / "walk.mcap"
+    recording = start_recording("low_state", "low_stat", "--out", str(path), "--seconds", "0.1")
+    publisher = node.create_publisher(LowState, "low_state", 10)
+    while recording.poll() is None:
+        publisher.publish(low_state(0))
+        time.sleep(0.01)
+    _, said = recording.communicate(timeout=60)
+    assert recording.returncode == 0, said
+    assert "did you mean /low_state?" in said
+    assert list(read_messages(path, lambda topic, typename: True))
+
+
 def test_a_recorder_of_faults_that_hears_no_controller_ends_with_1(tmp_path: Path) -> None:
     recording = start_recording("--ring", "2", "--out", str(tmp_path / "faults"), "--seconds", "0.5")
     recording.communicate(timeout=60)

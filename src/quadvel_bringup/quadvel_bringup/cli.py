@@ -560,7 +560,9 @@ def record(
             show_default="out/record.mcap, out/faults",
         ),
     ] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="Duration, s.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="Duration, s; it starts with the first messages.")
+    ] = None,
     ring: Annotated[
         float | None,
         typer.Option(min=1.0, help="Record faults only, each with the given seconds before it."),

@@ -22,7 +22,7 @@ from quadvel_nodes.number_text import number_text
 
 from .operator_commands import MODE_TIMEOUT_S, NO_STATES, RECOVERY_HINT, START_HINT
 from .processes import StopSignals
-from .session import DISCOVERY_TIMEOUT_S, Session, not_running
+from .session import DISCOVERY_TIMEOUT_S, NotRunningError, Session, not_running
 
 PUBLISH_PERIOD_S = 0.05
 """Time between two messages; the command mux drops a source after 0.5 s."""
@@ -36,6 +36,9 @@ SAME_TOLERANCE = 1e-3
 """Largest difference of equal commands, m/s or rad/s."""
 MAX_ESTIMATES = 10_000
 """Number of estimates for the mean, 50 s."""
+
+TWIST = "geometry_msgs/msg/Twist"
+"""Type of the velocity commands."""
 
 
 class DriveRun:
@@ -71,7 +74,7 @@ class DriveRun:
             NotRunningError: There is no command mux or no controller.
         """
         if not self._wait(self._publisher.get_subscription_count, DISCOVERY_TIMEOUT_S):
-            raise not_running(self._session.node, f"{self._topic}: no subscriber; {START_HINT}")
+            raise self._no_subscriber()
         if not self._wait(lambda: self._states, DISCOVERY_TIMEOUT_S):
             raise not_running(self._session.node, f"controller/state: no message; {START_HINT}")
         if self._signals.received:
@@ -82,6 +85,19 @@ class DriveRun:
             lambda: self._states[-1].mode_name not in READY_MODES or not self.refusal(), READY_TIMEOUT_S
         )
         return self.refusal()
+
+    def _no_subscriber(self) -> NotRunningError:
+        """Return an error that names the topics on which somebody takes velocities, if there are any."""
+        node, text = self._session.node, f"{self._topic}: no subscriber"
+        taken = [
+            topic
+            for topic, types in node.get_topic_names_and_types()
+            if TWIST in types
+            and any(one.topic_type == TWIST for one in node.get_subscriptions_info_by_topic(topic))
+        ]
+        if taken:
+            return NotRunningError(f"{text} for velocities, which are taken on {', '.join(taken)}")
+        return not_running(node, f"{text}; {START_HINT}")
 
     def _wait(self, is_so: Callable[[], Any], seconds: float) -> bool:
         """Spin until the predicate holds or Ctrl-C arrives.

@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from datetime import datetime
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,8 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
     Args:
         path: The file to write.
         topics: Topics to record; empty for all.
-        seconds: Duration, s, or None.
+        seconds: Duration, s, or None. It starts when every given topic has brought a message (any
+            topic, if none is given), at the latest after session.DISCOVERY_TIMEOUT_S.
 
     Returns:
         Number of recorded messages.
@@ -46,11 +48,12 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
     quadvel_dds.install()
     from .recorder import Recorder
     from .recording_file import RecordingFile
-    from .session import Session
+    from .session import DISCOVERY_TIMEOUT_S, Session
 
     console = Console(stderr=True, soft_wrap=True)
     wanted = _absolute(topics)
-    ends = _end(seconds)
+    discovered_by = time.monotonic() + DISCOVERY_TIMEOUT_S
+    ends = float("inf")
     with (
         StopSignals() as signals,
         console.status("recording; Ctrl-C stops") as status,
@@ -62,20 +65,23 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
                 recorder.record_all(_with_description(wanted))
                 recorder.serve(session.executor, min(DISCOVERY_PERIOD_S, left))
                 status.update(f"{_summary(recorder.counts)}; Ctrl-C stops")
+                is_heard = recorder.counts.keys() >= set(wanted) if wanted else recorder.counts
+                if ends == float("inf") and (is_heard or time.monotonic() > discovered_by):
+                    ends = _end(seconds)
+            present = [topic for topic, _ in session.node.get_topic_names_and_types()]
         except OSError as error:
             written = f"after {_summary(recorder.counts)}; about the last second of them is unreadable"
             raise OSError(f"{path}: the recording ended {written}: {error.strerror}") from error
-    if not recorder.counts.keys() - {DESCRIPTION_TOPIC}:
+    if not recorder.counts.keys() - ({DESCRIPTION_TOPIC} - set(wanted)):
         path.unlink()
         sought = ", ".join(wanted) or "any topic"
+        advice = _spelling(wanted, present) or "is a robot running, and its simulator not paused?"
         console.print(
-            f"no message on {sought} on ROS domain {ros_domain()}; {path} was not written; "
-            "is a robot running, and its simulator not paused?"
+            f"no message on {sought} on ROS domain {ros_domain()}; {path} was not written; {advice}"
         )
         return 0
-    for topic in wanted:
-        if topic not in recorder.counts:
-            console.print(f"no message on {topic}")
+    for topic in sorted(set(wanted) - recorder.counts.keys()):
+        console.print("; ".join(filter(None, [f"no message on {topic}", _spelling([topic], present)])))
     console.print(f"{path}: {_summary(recorder.counts)}")
     return recorder.counts.total()
 
@@ -195,6 +201,13 @@ class FaultTrigger:
 def _absolute(topics: Sequence[str]) -> list[str]:
     """Return topics with a leading slash, as the graph names them."""
     return [topic if topic.startswith("/") else f"/{topic}" for topic in topics]
+
+
+def _spelling(topics: Sequence[str], present: Sequence[str]) -> str:
+    """Suggest present topics for those that nobody has; "" if there are none with a similar name."""
+    unknown = [topic for topic in topics if topic not in present]
+    near = [name for topic in unknown for name in get_close_matches(topic, present, 1)]
+    return f"did you mean {', '.join(near)}?" if near else ""
 
 
 def _with_description(topics: Sequence[str]) -> list[str]:
