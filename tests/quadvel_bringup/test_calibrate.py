@@ -94,7 +94,10 @@ def test_what_tells_nothing_is_refused_in_one_sentence_and_writes_nothing(
         ((), "name one with --suspended, with --standing, or both"),
         (("--standing", tmp_path / "none.mcap"), "there is no such file"),
         (("--standing", standing, "--robot", "go2"), "robot is 'aliengo', expected 'go2'"),
-        (("--suspended", standing), "hardly moves to and fro; record quadvel excite creep"),
+        (
+            ("--suspended", standing),
+            f"{standing}: suspended robot: FR_hip_joint hardly moves to and fro; record",
+        ),
     ):
         code, text = calibrate(*arguments, "--out", file)
         assert code == 2

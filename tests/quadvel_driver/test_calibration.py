@@ -211,7 +211,7 @@ def test_a_driver_refuses_the_calibration_of_another_robot(tmp_path: Path) -> No
         ("schema: 2", "expected the fields of a calibration with schema: 1"),
         ("[1, 2]", "expected the fields of a calibration"),
         (OFF.to_yaml().replace("FR_hip_joint", "hip"), "has other names than the twelve joints"),
-        (OFF.to_yaml().replace("roll: 0.03491", "roll: .nan"), "imu_mounting is"),
+        (OFF.to_yaml().replace("roll: 0.03491", "roll: .nan"), "imu_mounting: roll nan rad"),
         (OFF.to_yaml().replace("roll: 0.03491", "roll: 1.5"), "expected 2 angles within 0.35 rad"),
         (OFF.to_yaml().replace("roll: 0.03491", "roll: [1]"), "TypeError"),
         ("{", "calibration.yaml: no valid YAML"),

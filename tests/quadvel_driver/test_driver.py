@@ -356,6 +356,17 @@ def test_a_bad_parameter_ends_the_start_with_one_sentence(
     assert len(text.strip().splitlines()) == 1
 
 
+def test_a_second_driver_refuses_to_start(
+    start: Start, running: RunningBoard, controller: Controller
+) -> None:
+    start()
+    controller.spin_until(lambda: controller.heard["low_state"])
+    second = start()
+    _, text = second.communicate(timeout=40.0)
+    assert second.returncode == 2
+    assert "driver: low_state is already published, by another driver or" in text
+
+
 DYING_LINK = """
 import quadvel_dds
 quadvel_dds.install()

@@ -85,8 +85,12 @@ def calibrate_command(
     if suspended is None and standing is None:
         raise ValueError("no recording given: name one with --suspended, with --standing, or both")
     output_file(out)
-    chosen = _robot([path for path in (suspended, standing) if path], robot)
-    found = fit_calibration(chosen, _samples(suspended), _samples(standing))
+    recordings = [path for path in (suspended, standing) if path]
+    chosen = _robot(recordings, robot)
+    try:
+        found = fit_calibration(chosen, _samples(suspended), _samples(standing))
+    except CalibrationDataError as error:
+        raise ValueError(f"{', '.join(map(str, recordings))}: {error}") from None
     console = Console(soft_wrap=True)
     console.print(_table(found))
     for sentence in _findings(found, standing is not None):

@@ -49,13 +49,18 @@ class Calibration:
     robot: str = UNNAMED_ROBOT
 
     def __attrs_post_init__(self) -> None:
-        for field, size in (("joint_zeros", 12), ("imu_mounting", 2)):
-            value = getattr(self, field)
-            if np.shape(value) != (size,) or not (np.abs(value) <= MAX_OFFSET_RAD).all():
-                found = np.asarray(value).tolist()
-                raise CalibrationError(
-                    f"{field} is {found}, expected {size} angles within {MAX_OFFSET_RAD} rad"
-                )
+        for field, names in (("joint_zeros", JOINT_NAMES), ("imu_mounting", ("roll", "pitch"))):
+            value = np.asarray(getattr(self, field))
+            expected = f"expected {len(names)} angles within {MAX_OFFSET_RAD} rad"
+            if value.shape != (len(names),):
+                raise CalibrationError(f"{field} has the shape {value.shape}, {expected}")
+            wrong = [
+                f"{name} {angle:.3g}"
+                for name, angle in zip(names, value, strict=True)
+                if not abs(angle) <= MAX_OFFSET_RAD
+            ]
+            if wrong:
+                raise CalibrationError(f"{field}: {', '.join(wrong)} rad, {expected}")
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:

@@ -26,6 +26,8 @@ MAX_BLOCK_GAP_S = 0.5 * BLOCK_S
 """Blocks further apart than BLOCK_S and this are not neighbours, s: states are missing."""
 REVERSAL_MARGIN_S = 0.1
 """Time around a reversal to leave out, s: the joint sticks there."""
+CREEP_HINT = "record quadvel excite creep with the robot suspended"
+"""How to make the record that is expected."""
 UP = np.array([0.0, 0.0, 1.0])
 """Vertical in the world frame."""
 
@@ -79,9 +81,7 @@ class Samples:
         for i, name in enumerate(JOINT_NAMES):
             moving = self.dq[:, i]
             if min((moving > MIN_MOVING_SPEED).sum(), (moving < -MIN_MOVING_SPEED).sum()) < MIN_ROWS // 2:
-                raise CalibrationDataError(
-                    f"{name} hardly moves to and fro; record quadvel excite creep with the robot suspended"
-                )
+                raise CalibrationDataError(f"suspended robot: {name} hardly moves to and fro; {CREEP_HINT}")
 
     def check_standing(self) -> None:
         """Check that the robot stands still, on straight enough legs.
@@ -92,12 +92,12 @@ class Samples:
         speed = float(np.abs(self.dq.mean(axis=0)).max()), float(np.median(np.abs(self.dq)))
         if max(speed) > MAX_STANDING_SPEED:
             raise CalibrationDataError(
-                f"the joints move at {max(speed):.2f} rad/s, expected a robot that stands still"
+                f"standing robot: the joints move at {max(speed):.2f} rad/s, expected a robot that stands still"
             )
         bent = self.q.mean(axis=0).reshape(4, 3)[:, 2]
         if (bent < -MAX_STANDING_BEND_RAD).any():
             raise CalibrationDataError(
-                f"a knee is bent by {bent.min():.2f} rad, expected a robot that stands"
+                f"standing robot: a knee is bent by {bent.min():.2f} rad, expected a robot that stands"
             )
 
 
@@ -145,7 +145,8 @@ class Motion:
         whole = whole[1:] & whole[:-1]
         if whole.sum() < MIN_ROWS:
             raise CalibrationDataError(
-                f"{whole.sum()} stretches of {BLOCK_S} s without a gap, expected {MIN_ROWS} at least"
+                f"suspended robot: {whole.sum()} stretches of {BLOCK_S} s without a gap, expected {MIN_ROWS} at least; "
+                f"{CREEP_HINT}"
             )
         ddq = (dq[2:] - dq[:-2]) / (time[2:] - time[:-2])[:, None]
         steady = _is_steady(dq)[1:-1]

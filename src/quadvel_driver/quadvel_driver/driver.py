@@ -28,7 +28,7 @@ from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.flat_messages import decode_low_cmd, encode_low_state
 from quadvel_nodes.messages import Refusals
-from quadvel_nodes.node import read_parameters, request_exit, run
+from quadvel_nodes.node import create_only_publisher, read_parameters, request_exit, run
 from quadvel_nodes.robot_check import RobotCheck
 from quadvel_nodes.robot_view import RobotView
 from quadvel_nodes.system_time import SystemTime
@@ -95,7 +95,7 @@ class Driver(Node):
         super().destroy_node()
 
     def _create_publishers(self) -> None:
-        self._low_state = self.create_publisher(LowState, "low_state", 10)
+        self._low_state = create_only_publisher(self, LowState, "low_state", 10)
         self._motors = self.create_publisher(MotorStatus, "motor_status", 1)
         self._view = RobotView(
             self, self._robot, ORIENTATION_STD_RAD, ANGULAR_VELOCITY_STD, LINEAR_ACCELERATION_STD
