@@ -114,6 +114,10 @@ def test_clean_log_yields_only_its_rate() -> None:
         ({name: fields()[name] / SHARE for name in ("q", "dq", "q_des")}, "q: up to "),
         ({"q_des": fields()["q_des"] / SHARE}, "q_des: about 57 times as large as q: degrees?"),
         ({"dq": -fields()["dq"]}, "dq: has the opposite sign"),
+        (
+            {"q": fields()["q_des"], "q_des": fields()["q"]},
+            "q: dq is the slope of q_des, and not of q, on FR_hip",
+        ),
         ({"tau": -fields()["tau"]}, "tau: has the opposite sign on FR_hip"),
         (
             {"q_des": exchanged(fields()["q_des"])},

@@ -34,6 +34,10 @@ UNIT_CORRELATION, UNIT_FACTOR = 0.95, 1.4
 """A ratio of the slope of q to dq is a unit if their correlation exceeds `UNIT_CORRELATION` and the
 ratio, or its inverse, this factor.
 """
+EXCHANGED_CORRELATION, EXCHANGED_ERROR_RATIO = 0.9, 0.25
+"""q and q_des are exchanged if dq correlates above `EXCHANGED_CORRELATION` with the slope of q_des,
+which leaves less than this share of what the slope of q leaves of its variance.
+"""
 UNRELATED_CORRELATION = 0.3
 """If the correlation of dq with the slope of q is below, dq is not the speed of that joint."""
 ZERO_SPEED_SHARE = 2e-4
@@ -88,6 +92,33 @@ def wrapped_angles(log: Log) -> Iterator[Finding | Log]:
         dq = np.where(differs, log.dq + leap, log.dq)
         yield attrs.evolve(log, q=q, dq=dq, q_des=np.where(hit, q_des, log.q_des))
         return
+
+
+def exchanged_angles(log: Log) -> Iterator[Finding]:
+    """Speeds that are the slope of q_des and not of q.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        A refusal, if it is so on most joints that move.
+    """
+    if "dq" in log.derived:
+        return
+    row = sample_rows(log)
+    dq = np.asarray(log.dq[row], dtype=float)
+    q_des = np.asarray(log.q_des[log.command_rows(log.t)], dtype=float)
+    own, other = (_correlation(slope_at_rows(log, x, row), dq) for x in (log.q, q_des))
+    moving = (_rms(dq) > MOVING_SPEED_RAD_S) & (np.ptp(log.q, axis=0) > MOVING_SPAN_RAD)
+    hit = (
+        moving
+        & (other > EXCHANGED_CORRELATION)
+        & (1.0 - other**2 < EXCHANGED_ERROR_RATIO * (1.0 - own * np.abs(own)))
+    )
+    if 2 * hit.sum() > moving.sum():
+        listed = format_names(log.joints_where(hit))
+        text = f"q: dq is the slope of q_des, and not of q, on {listed}: are q and q_des exchanged?"
+        yield Finding("refusal", "q", log.joints_where(hit), text)
 
 
 def unusable_speed(log: Log) -> Iterator[Finding | Log]:

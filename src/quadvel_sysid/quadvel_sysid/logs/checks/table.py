@@ -75,6 +75,13 @@ ROW_CHECKS = (
         "unwrapped, with a warning",
     ),
     Check(
+        angles.exchanged_angles,
+        "correlation of dq with the slope of q_des; variance of dq that this slope leaves over that "
+        "which the slope of q leaves, on most joints that move",
+        f"{angles.EXCHANGED_CORRELATION:g}; {angles.EXCHANGED_ERROR_RATIO:g}",
+        "refusal",
+    ),
+    Check(
         angles.unusable_speed,
         "dq that is missing, or has one sign while the slope of q has both; correlation of the two; "
         "steps of the encoder of q",
