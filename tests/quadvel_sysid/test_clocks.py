@@ -8,7 +8,7 @@ import attrs
 import numpy as np
 import pytest
 
-from quadvel_sysid.data.clocks import align_commands, choose_stamps, clock_findings
+from quadvel_sysid.data.clocks import align_commands, choose_stamps, clock_findings, remove_drift
 from quadvel_sysid.data.dataset import Dataset
 from quadvel_sysid.data.split import block_length, reported_rows
 from quadvel_sysid.logs.check_log import CheckedLog
@@ -51,6 +51,30 @@ def test_equal_clocks_are_left_alone() -> None:
     aligned, clocks = align_commands(logs, clocks, WINDOWS, block_length(logs))
     assert all(abs(one.offset_s or 0.0) <= one.half_width_s for one in clocks)
     assert [one.t_cmd[0] for one in aligned.logs] == [one.t_cmd[0] for one in logs.logs]
+
+
+@pytest.mark.parametrize("drift", [6e-4, -6e-4])
+def test_command_stamps_of_a_clock_that_drifts_are_put_on_that_of_the_states(drift: float) -> None:
+    log = record(parameters(joints=2), 2, 10.0, 500, seed=1)
+    logs = dataset(attrs.evolve(log, t_cmd=log.t_cmd * (1.0 - drift)))
+    clocks = choose_stamps(logs, WINDOWS, block_length(logs), SEARCH_DEFAULTS)[1]
+    corrected, (clock,) = remove_drift(logs, clocks, WINDOWS, block_length(logs))
+    assert abs(clock.drift - drift) < clock.drift_half_width < 1e-4
+    late = corrected.logs[0].t_cmd - log.t_cmd
+    assert np.ptp(late) < 5e-4  # a constant offset is left
+    assert any(
+        "the clock of the commands falls behind" in one.text for _, one in clock_findings(corrected, [clock])
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_clocks_that_do_not_drift_are_left_alone(seed: int) -> None:
+    log = record(parameters(joints=2), 2, 6.0, 500, seed=seed)
+    logs = dataset(attrs.evolve(log, t_cmd=log.t_cmd - 1e-3))
+    clocks = choose_stamps(logs, WINDOWS, block_length(logs), SEARCH_DEFAULTS)[1]
+    same, found = remove_drift(logs, clocks, WINDOWS, block_length(logs))
+    assert found == clocks
+    assert same.logs[0] is logs.logs[0]
 
 
 def test_one_log_says_that_its_clocks_cannot_be_told_from_the_delay() -> None:

@@ -1,12 +1,12 @@
-"""Clocks of recordings: jittering stamps, and the offset between the clocks of states and commands.
+"""Clocks of recordings: jittering stamps, and drift and offset between the clocks of states and commands.
 
-Both belong to a recording, not to the robot. They are chosen by the torque error of the plain model
+They belong to a recording, not to the robot. They are chosen by the torque error of the plain model
 (`plain_model`: PD gains and two delays), on rows that do not enter the reported error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import attrs
 import numpy as np
@@ -29,6 +29,10 @@ _MAX_OFFSET_S = 0.004
 _OFFSET_STEPS_S = (0.0005, 0.00005)
 """Largest offset of the clocks, and steps of the coarse and the fine grid, s."""
 _JACKKNIFE_GROUPS = 10
+_MAX_DRIFT_S = 0.010
+"""Largest drift between the two clocks over a recording, s: 100 ppm, as of two crystals, in 100 s."""
+_DRIFT_STEPS_S = (0.0005, 0.0001)
+"""Steps of the coarse and the fine grid of delays, whose change over time is the drift, s."""
 
 
 @attrs.frozen
@@ -42,6 +46,9 @@ class RecordingClock:
         offset_s: Delay of its commands relative to the mean of the fitted recordings, s; its command
             stamps were shifted by it. None if commands and states have the same stamps.
         half_width_s: Half width of the 95 % interval of the offset, s.
+        drift: Time by which its command clock fell behind that of its states, for each second; its
+            command stamps were corrected. 0 if no drift is significant.
+        drift_half_width: Half width of the 95 % interval of the drift.
     """
 
     log: str
@@ -49,6 +56,8 @@ class RecordingClock:
     even: bool
     offset_s: float | None = None
     half_width_s: float = 0.0
+    drift: float = 0.0
+    drift_half_width: float = 0.0
 
 
 def known_offsets(clocks: Sequence[RecordingClock]) -> tuple[float, ...]:
@@ -93,6 +102,36 @@ def choose_stamps(
                 stamped[k] = log
         clocks.append(RecordingClock(mine[0].name, dataset.is_heldout(recording), is_even))
     return dataset.with_logs(stamped), clocks
+
+
+def remove_drift(
+    dataset: Dataset, clocks: Sequence[RecordingClock], windows: Sequence[float], length: float
+) -> tuple[Dataset, list[RecordingClock]]:
+    """Put the command stamps of each recording on the clock of its states, where the two drift apart.
+
+    Two computers' clocks differ by some parts in 100,000, and clocks that software makes by more. A
+    delay that changes linearly over the recording replaces a constant one if it predicts the torque
+    significantly better: it is fitted on every other cluster of rows and tested on the rest, in a
+    one-sided t test at the level 0.01.
+
+    Args:
+        dataset: The logs.
+        clocks: Clock of each recording.
+        windows: Windows (s) to try in the plain model, over which the drive averages commands.
+        length: Length of the blocks of rows, s.
+
+    Returns:
+        The logs with the corrected stamps, and the clocks with their drift.
+    """
+    logs, found = list(dataset.logs), []
+    for recording, (clock, pieces) in enumerate(zip(clocks, dataset.pieces, strict=True)):
+        mine = [logs[k] for k in pieces]
+        if all(log.has_own_command_stamps for log in mine):
+            clock, mine = _without_drift(dataset, recording, clock, mine, windows, length)
+        for k, log in zip(pieces, mine, strict=True):
+            logs[k] = log
+        found.append(clock)
+    return dataset.with_logs(logs), found
 
 
 def align_commands(
@@ -142,6 +181,10 @@ def clock_findings(dataset: Dataset, clocks: Sequence[RecordingClock]) -> list[t
         if clock.even:
             text = "the even clock of the sender explains the torque better and was restored"
             found.append((clock.log, f"t: the stamps jitter as those of received messages do; {text}"))
+        if clock.drift:
+            rate, half = 1e6 * clock.drift, 1e6 * clock.drift_half_width
+            text = f"falls behind that of the states by {rate:.0f} us each second (95 %: +- {half:.0f} us)"
+            found.append((clock.log, f"t_cmd: the clock of the commands {text}; their stamps were corrected"))
         if clock.offset_s is not None:
             size = f"{1e3 * clock.offset_s:.2f} ms (95 %: +- {1e3 * clock.half_width_s:.2f} ms)"
             text = "relative to the mean of the fitted logs, an offset between the clocks of the recording"
@@ -196,25 +239,148 @@ def _fitted_eam(dataset: Dataset, windows: Sequence[float], length: float) -> Ea
     return fit_eam(samples, rows, windows=windows)
 
 
+@attrs.frozen(eq=False)
+class _DelayProfile:
+    """Squared error of the plain model on a recording for each delay of its commands.
+
+    Attributes:
+        eam: The plain model, without that delay.
+        samples: Rows of the recording.
+        rows: Rows that are used, (N, J).
+        starts: Row at which each of the C clusters begins, (C,).
+    """
+
+    eam: Eam
+    samples: Samples
+    rows: Bools
+    starts: Indices
+
+    @classmethod
+    def of(
+        cls,
+        eam: Eam | None,
+        logs: Sequence[Log],
+        dataset: Dataset,
+        recording: int,
+        windows: Sequence[float],
+        length: float,
+    ) -> _DelayProfile:
+        """Prepare the rows of one recording; without a model, that of the recording itself."""
+        samples = Samples.of(logs)
+        rows = _own_rows(dataset, recording, samples, length)
+        return cls(eam or fit_eam(samples, rows, windows=windows), samples, rows, cluster_starts(samples))
+
+    def errors(self, delays: Array) -> Array:
+        """Return the squared error of each cluster at each delay (D,), s, (D, C)."""
+        moved = (attrs.evolve(self.eam, input_delay=self.eam.input_delay + delay) for delay in delays)
+        squares = ((self.samples.tau - one.predict(self.samples)) ** 2 for one in moved)
+        return np.stack(
+            [np.add.reduceat(np.sum(one, axis=1, where=self.rows), self.starts) for one in squares]
+        )
+
+    @property
+    def time(self) -> Array:
+        """Time at which each cluster begins, (C,), s."""
+        return self.samples.t[self.starts]
+
+
 def _offset(dataset: Dataset, recording: int, eam: Eam, length: float) -> tuple[float, float]:
     """Delay (s) of the commands beyond the model's input delay, and its 95 % half width."""
-    samples = Samples.of([dataset.logs[k] for k in dataset.pieces[recording]])
-    rows, starts = _own_rows(dataset, recording, samples, length), cluster_starts(samples)
-
-    def errors(shifts: Array) -> Array:
-        """Squared error of each cluster (C,) at each shift (S,), (S, C)."""
-        moved = (attrs.evolve(eam, input_delay=eam.input_delay + shift) for shift in shifts)
-        squares = ((samples.tau - one.predict(samples)) ** 2 for one in moved)
-        return np.stack([np.add.reduceat(np.sum(one, axis=1, where=rows), starts) for one in squares])
-
+    logs = [dataset.logs[k] for k in dataset.pieces[recording]]
+    profile = _DelayProfile.of(eam, logs, dataset, recording, (), length)
     coarse, fine = _OFFSET_STEPS_S
-    shifts = np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + coarse / 2, coarse)
-    about = shifts[int(np.argmin(errors(shifts).sum(axis=1)))]
-    shifts = about + np.arange(-2.0 * coarse, 2.0 * coarse + fine / 2, fine)
-    each = errors(shifts)
-    best = float(shifts[int(np.argmin(each.sum(axis=1)))])
-    # Jackknife over groups of clusters: variance (G - 1) / G sum (x_g - mean x)^2.
-    group = np.arange(each.shape[1]) * _JACKKNIFE_GROUPS // each.shape[1]
-    left = [shifts[int(np.argmin(each[:, group != g].sum(axis=1)))] for g in range(int(group.max()) + 1)]
+    delays = np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + coarse / 2, coarse)
+    about = delays[int(np.argmin(profile.errors(delays).sum(axis=1)))]
+    delays = about + np.arange(-2.0 * coarse, 2.0 * coarse + fine / 2, fine)
+    each = profile.errors(delays)
+
+    def best(used: Bools | slice) -> float:
+        return float(delays[int(np.argmin(each[:, used].sum(axis=1)))])
+
+    return best(slice(None)), min(_jackknife_half_width(best, each.shape[1]) + fine, _MAX_OFFSET_S)
+
+
+def _jackknife_half_width(estimate: Callable[[Bools], float], clusters: int) -> float:
+    """Half width of the 95 % interval of an estimate from clusters, by leaving out groups of them."""
+    # Variance (G - 1) / G sum (x_g - mean x)^2 over the estimates x_g without group g.
+    group = np.arange(clusters) * _JACKKNIFE_GROUPS // clusters
+    left = [estimate(group != g) for g in range(int(group.max()) + 1)]
     spread = np.sqrt((len(left) - 1) * np.var(left)) if len(left) > 1 else np.inf
-    return best, min(float(stats.norm.ppf(0.975) * spread + fine), _MAX_OFFSET_S)
+    return float(stats.norm.ppf(0.975) * spread)
+
+
+def _without_drift(
+    dataset: Dataset,
+    recording: int,
+    clock: RecordingClock,
+    logs: Sequence[Log],
+    windows: Sequence[float],
+    length: float,
+) -> tuple[RecordingClock, list[Log]]:
+    """Return a recording's clock with its drift, and its logs without; both unchanged if there is none."""
+    # Twice: the gains of the first model are those of delays that are wrong most of the time.
+    for step, most in zip(_DRIFT_STEPS_S, (_MAX_DRIFT_S, 2.0 * _DRIFT_STEPS_S[0]), strict=True):
+        profile = _DelayProfile.of(None, logs, dataset, recording, windows, length)
+        lines = _DelayLines.of(profile, step, most)
+        if not clock.drift and not lines.drift_is_significant():
+            return clock, list(logs)
+        drift, origin = lines.drift(), logs[0].t_cmd[0]
+        logs = [attrs.evolve(log, t_cmd=log.t_cmd + drift * (log.t_cmd - origin)) for log in logs]
+        clock = attrs.evolve(clock, drift=clock.drift + drift, drift_half_width=lines.half_width())
+    return clock, list(logs)
+
+
+@attrs.frozen(eq=False)
+class _DelayLines:
+    """Delays of the commands that change linearly with time: d(t) = b + a (t - t_mid) / T.
+
+    Attributes:
+        time: Time of each cluster, (C,), s.
+        delays: Delays of a grid, (D,), s, ascending by `step`.
+        each: Squared error of each cluster at each of them, (D, C).
+        step: Step of the grid, s.
+    """
+
+    time: Array
+    delays: Array
+    each: Array
+    step: float
+
+    @classmethod
+    def of(cls, profile: _DelayProfile, step: float, most: float) -> _DelayLines:
+        """Compute the errors on a grid of delays within half of the largest drift."""
+        reach = round(0.5 * most / step)
+        delays: Array = step * np.arange(-reach, reach + 1, dtype=np.float64)
+        return cls(profile.time, delays, profile.errors(delays), step)
+
+    def drift(self, used: Bools | slice = slice(None)) -> float:
+        """Return the change of the delay for each second, from the clusters `used`."""
+        return self._best_line(used)[0] / float(np.ptp(self.time))
+
+    def half_width(self) -> float:
+        """Return the half width of the 95 % interval of the drift, at least a step of the grid."""
+        step = 2.0 * self.step / float(np.ptp(self.time))
+        return _jackknife_half_width(self.drift, len(self.time)) + step
+
+    def drift_is_significant(self) -> bool:
+        """Return whether a line beats a constant delay on clusters that neither was fitted to."""
+        tested = np.arange(len(self.time)) % 2 == 1
+        line, constant = self._best_line(~tested), self._best_line(~tested, with_drift=False)
+        if not line[0]:
+            return False
+        gain = (self._errors(*constant) - self._errors(*line))[tested]
+        return bool(stats.ttest_1samp(gain, 0.0, alternative="greater").pvalue < _SIGNIFICANCE_LEVEL)
+
+    def _best_line(self, used: Bools | slice, with_drift: bool = True) -> tuple[float, float]:
+        """Return the change over the recording and the middle delay, s, with the least error."""
+        changes = 2.0 * self.delays if with_drift else np.zeros(1)
+        lines = [(change, middle) for change in changes for middle in self.delays]
+        return min(lines, key=lambda line: float(self._errors(*line)[used].sum()))
+
+    def _errors(self, change: float, middle: float) -> Array:
+        """Return the squared error of each cluster, (C,), for a line; between grid points linearly."""
+        share = (self.time - self.time[0]) / np.ptp(self.time) - 0.5
+        at = np.clip((middle + change * share - self.delays[0]) / self.step, 0.0, len(self.delays) - 1.001)
+        below, here = np.floor(at).astype(int), np.arange(len(at))
+        weight = at - below
+        return np.asarray((1.0 - weight) * self.each[below, here] + weight * self.each[below + 1, here])

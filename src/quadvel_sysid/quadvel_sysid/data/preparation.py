@@ -14,7 +14,7 @@ import numpy as np
 from ..logs.findings import Finding
 from ..logs.log import LogError
 from ..options import SEARCH_DEFAULTS, SearchOptions
-from .clocks import RecordingClock, align_commands, choose_stamps, clock_findings
+from .clocks import RecordingClock, align_commands, choose_stamps, clock_findings, remove_drift
 from .dataset import Dataset
 from .noise import noise_variance
 from .plain_model import Eam, fit_eam
@@ -73,6 +73,7 @@ def preprocess(
     """
     length = block_length(dataset, shortest)
     dataset, clocks = choose_stamps(dataset, windows, length, options)
+    dataset, clocks = remove_drift(dataset, clocks, windows, length)
     dataset, clocks = align_commands(dataset, clocks, windows, length)
 
     def fit_logs(steady: float) -> Preprocessed:

@@ -254,6 +254,10 @@ def _clock_entry(clock: RecordingClock) -> dict[str, Any]:
         "log": clock.log,
         "heldout": clock.heldout,
         "even": clock.even,
+        "command_drift_ppm": 1e6 * clock.drift,
+        "command_drift_ppm_ci95": (
+            1e6 * (clock.drift + clock.drift_half_width * np.array([-1.0, 1.0]))
+        ).tolist(),
         "command_offset_ms": None if offset is None else 1e3 * offset,
         "command_offset_ms_ci95": interval,
     }
