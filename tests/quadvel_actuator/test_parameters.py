@@ -34,8 +34,10 @@ def test_probable_pairs_lie_under_one_and_a_half_times_the_least_error():
     assert [pair.mse for pair in parameters.probable_pairs] == [0.25, 0.374]
 
 
-def test_ideal_is_a_plain_pd_law():
-    ideal = ActuatorParameters.ideal(ALIENGO)
+@pytest.mark.parametrize("robot", [ALIENGO, GO2], ids=lambda robot: robot.name)
+def test_ideal_is_a_plain_pd_law(robot):
+    ideal = ActuatorParameters.ideal(robot)
+    assert ideal.effects == ()
     assert (ideal.delta_kp, ideal.delta_kd, ideal.torque_noise) == (0.0, 0.0, 0.0)
     assert ideal.probable_pairs == (DelayPair(0.0, 0.0, 0.0),)
 

@@ -50,10 +50,10 @@ SERVICES = {"reset": ResetSim, "pause": SetBool, "step": StepSim, "push": Push}
 class SimProcess:
     """The node as `ros2 run` starts it."""
 
-    def __init__(self, **parameters: object) -> None:
+    def __init__(self, program: str = PROGRAM, **parameters: object) -> None:
         arguments = [item for name, value in parameters.items() for item in ("-p", f"{name}:={value}")]
         self.process = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, "--ros-args", *arguments], stderr=subprocess.PIPE, text=True
+            [sys.executable, "-c", program, "--ros-args", *arguments], stderr=subprocess.PIPE, text=True
         )
 
     def interrupt(self) -> None:
@@ -137,8 +137,8 @@ def start() -> Iterator[Callable[..., SimProcess]]:
     """Starts the node with parameters; it is killed after the test if it still runs."""
     started: list[SimProcess] = []
 
-    def begin(**parameters: object) -> SimProcess:
-        started.append(SimProcess(**parameters))
+    def begin(**arguments: Any) -> SimProcess:
+        started.append(SimProcess(**arguments))
         return started[-1]
 
     yield begin

@@ -105,12 +105,15 @@ def test_the_services_reset_pause_step_and_push(start: Start, peer: Any) -> None
     assert peer.call("pause", data=True).success
     peer.spin(0.2)
     count, tick = len(states), states[-1].tick
-    force = Wrench(force=Vector3(x=0.0, y=0.0, z=40.0 * ALIENGO.mass * GRAVITY))
+    force = Wrench(force=Vector3(x=0.0, y=0.0, z=9.0 * ALIENGO.mass * GRAVITY))
     assert peer.call("push", wrench=force, duration=0.01).success
+    too_large = peer.call("push", wrench=Wrench(force=Vector3(x=1e9, y=0.0, z=0.0)), duration=0.1)
+    assert not too_large.success
+    assert "push: force: found 1e+09 N" in too_large.message
     peer.answer = answer
     assert peer.call("step", steps=12).success
     peer.spin_until(
-        lambda: len(states) > count and peer.heard["ground_truth/odom"][-1].twist.twist.linear.z > 2.0
+        lambda: len(states) > count and peer.heard["ground_truth/odom"][-1].twist.twist.linear.z > 0.5
     )
     peer.spin_until(lambda: states[-1].tick == tick + 12)
     assert [state.tick - tick for state in states[count:]] == [5, 10, 12]
@@ -192,13 +195,26 @@ def test_ctrl_c_ends_it_with_status_0_even_when_it_comes_twice(start: Start, pee
     assert all(line.startswith(("[INFO]", "[WARN]")) for line in text.splitlines()), text
 
 
+DIVERGING = """
+import quadvel_dds
+quadvel_dds.install()
+from quadvel_nodes.node import run
+from quadvel_sim.sim_node import SimNode
+from quadvel_sim.simulator import Simulator
+class Diverging(Simulator):
+    def push(self, *args):
+        self.data.qvel[:] = 1e300
+run(lambda: SimNode(Diverging))
+"""
+
+
 def test_a_diverged_simulation_ends_the_node_with_one_sentence(
     start: Start, peer: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its log where it stands
-    simulation = start(mode="fast")
+    simulation = start(program=DIVERGING, mode="fast")
     peer.spin_until(lambda: peer.heard["low_state"])
-    assert peer.call("push", wrench=Wrench(force=Vector3(x=1e300, y=0.0, z=0.0)), duration=1.0).success
+    assert peer.call("push", duration=1.0).success
     status, text = simulation.end()
     assert status == 1
     assert "the robot's state is not finite" in text

@@ -525,6 +525,13 @@ def test_bad_orders_are_refused_by_name() -> None:
         sim.push("trunk", [np.inf, 0.0, 0.0])
     with pytest.raises(ValueError, match=r"push: duration: found 0\.0 s, expected at least 0\.001 s"):
         sim.push("trunk", [1.0, 0.0, 0.0], duration=0.0)
+    sim.push("trunk", [2000.0, 0.0, 0.0])
+    with pytest.raises(
+        ValueError, match="push: force: found 2800 N of all pushes together, expected at most 2446"
+    ):
+        sim.push("RL_calf", [0.0, 0.0, -800.0])
+    with pytest.raises(ValueError, match=r"push: torque: found 60 N m .* at most 48"):
+        sim.push("trunk", np.zeros(3), [60.0, 0.0, 0.0])
 
 
 def test_a_diverged_run_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

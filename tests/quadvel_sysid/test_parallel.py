@@ -39,6 +39,8 @@ def test_errors_of_tasks_and_killed_workers_are_raised(samples):
     for work in (lambda k: 1 // 0, work_of_the_worker(lambda k: 1 // 0)):
         with pytest.raises(ZeroDivisionError):
             parallel_map(work, 4, 2, samples)
+    with pytest.raises(AttributeError, match="pickle"):  # a result that cannot be sent
+        parallel_map(work_of_the_worker(lambda k: lambda: k), 4, 2, samples)
     with pytest.raises(ChildProcessError, match="killed"):
         parallel_map(work_of_the_worker(lambda k: os.kill(os.getpid(), signal.SIGKILL)), 4, 2, samples)
 

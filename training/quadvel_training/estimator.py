@@ -42,9 +42,9 @@ class VelocityNetwork(Recurrent):
     """Velocity filter whose gains an LSTM sets: network input to velocity (3) and log variance (3).
 
     At every tick the velocity of the tick before, propagated by the IMU, is mixed with the
-    velocities by the four legs. The LSTM gives the five shares, a correction and the variance. In
-    the last three numbers of its first part the state holds the velocity; those of its second part
-    are unused.
+    velocities by the four legs. The LSTM gives the five shares, a correction and the variance. The
+    last three numbers of the state's first part are the velocity; those of its second part are
+    unused.
     """
 
     def __init__(self, layout: InputLayout) -> None:
@@ -181,7 +181,7 @@ class EstimatedWalks:
     def start_over(self, forget: float) -> None:
         """Start new walks where one ended; some of the others lose their memory.
 
-        The loss has the effect of a gap in the stream.
+        A lost memory acts like a gap in the stream.
 
         Args:
             forget: share of these others.
@@ -236,8 +236,8 @@ def loss_terms(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Losses of velocity and variance.
 
-    The likelihood trains the variance alone. Trained on it as well, the network gives up velocities
-    that are hard to see for a large variance.
+    The likelihood trains the variance alone. If it trained the velocity, too, the network would state
+    a large variance where velocities are hard to see, instead of learning them.
 
     Args:
         output: (T, N, 6), velocity and log variance.
@@ -324,7 +324,7 @@ class EstimatorRun:
             done: share of the budget that is spent.
 
         Returns:
-            RMS error per axis on each ground (m/s), and the likelihood.
+            RMS error per axis on each ground (m/s), and the mean negative log likelihood (nll).
         """
         c = self.config
         set_rate(self.optimiser, cosine(c.learning_rate, c.final_learning_rate, done))
@@ -343,13 +343,14 @@ class EstimatorRun:
         return {"flat": seen["flat"] ** 0.5, "rough": seen["rough"] ** 0.5, "nll": seen["nll"]}
 
     def _learn(self, ids: torch.Tensor, data: list[Sequence], remember: bool) -> dict[str, float]:
-        """Take one step; return the mean squared error per axis on each ground, and the likelihood."""
-        losses, squares = [], []
+        """Take one step; return the mean squared error per axis on each ground, and nll, the mean of both."""
+        losses, squares, likelihoods = [], [], []
         for walk, (inputs, truth, mask) in zip(self.walks, data, strict=True):
             output, state = self.network(inputs[:, ids], select(walk.state, ids))
             square, likelihood = loss_terms(output, truth[:, ids], mask[:, ids])
             losses.append(10.0 * square + 0.1 * likelihood)
             squares.append(float(square.detach()) / 3)
+            likelihoods.append(float(likelihood.detach()))
             if remember:
                 walk.store_memory(ids, state)
         loss = torch.stack(losses).mean()
@@ -358,4 +359,4 @@ class EstimatorRun:
         process_group.share_gradients(self.network)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimiser.step()
-        return {"flat": squares[0], "rough": squares[1], "nll": float(likelihood.detach())}
+        return {"flat": squares[0], "rough": squares[1], "nll": float(np.mean(likelihoods))}

@@ -41,10 +41,9 @@ class PpoConfig:
         critic_steps: critic steps per actor step; a memoryless critic affords many small ones.
         learning_rate: initial learning rate of the actor.
         max_learning_rate: upper bound of the adapted learning rate.
-        target_kl: KL divergence per update that the learning rate is adapted to, computed as if
-            exploration were white and equal for all robots: with correlated noise lasting shifts
-            would count too little. None keeps the rate, as it must if an update is a single step,
-            before which nothing has shifted.
+        target_kl: KL divergence per update that the learning rate is adapted to. It is computed as if
+            exploration were white and equal for all robots, because lasting shifts would count too
+            little with correlated noise. Use None if an update has one step: its KL is always 0.
         entropy: weight of the entropy bonus.
         symmetry: w_sym of Eq. 8.
         smoothness: w_smooth of Eq. 8.
@@ -142,7 +141,8 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
         mask: (T, N), 1 for living samples.
 
     Returns:
-        A number whose mean over the processes is the mean over all samples; so are its gradients.
+        A number whose mean over the processes is the mean over all samples; the same holds for its
+        gradients.
     """
     return (values * mask).sum() / process_group.mean(mask.sum()).clamp(min=1)
 
@@ -351,9 +351,9 @@ class Ppo:
     def _log_prob(self, r: Rollout, ids: Tensor | slice, mean: Tensor) -> Tensor:
         """Log density (T, N), up to a constant, of the actions of robots `ids` under `mean`.
 
-        It is the density of the innovations given the whole past: the present deviation depends on
-        what the mean was before. If the decayed noise were a given offset, the gradient would be
-        that of a mean that changes along with the noise.
+        It is the density of the innovations, w[t] = n[t] - rho n[t-1] with n = action - mean, where
+        both n[t] and n[t-1] depend on the policy. With n[t-1] as a constant the gradient would
+        miss the second part.
         """
         draws = self._innovations(r.action[:, ids] - mean, r.noise[ids])
         if r.spread is not None:

@@ -170,7 +170,7 @@ class ActuatorParameters:
         for key, value in attrs.asdict(self).items():
             if key in _COMMENTS:
                 lines += ["", f"# {_COMMENTS[key]}"]
-            flow = None if isinstance(value, list) else False  # a list: one line for each of its elements
+            flow = None if isinstance(value, list) else False  # of a list of records, one line each
             text = yaml.safe_dump({key: value}, default_flow_style=flow, sort_keys=False, width=110)
             lines.append(text.rstrip())
         Path(path).write_text("\n".join(lines) + "\n")
@@ -208,9 +208,15 @@ class ActuatorParameters:
             robot: The robot.
 
         Returns:
-            Those of the robot without delay, gain deviation and noise; the torque limit stays.
+            Those of the robot without delay, gain deviation, effects and noise; the torque limit stays.
         """
         at_once = DelayPair(0.0, 0.0, 0.0)
         return attrs.evolve(
-            cls.of(robot), name="ideal", delta_kp=0.0, delta_kd=0.0, pairs=(at_once,), torque_noise=0.0
+            cls.of(robot),
+            name="ideal",
+            delta_kp=0.0,
+            delta_kd=0.0,
+            pairs=(at_once,),
+            torque_noise=0.0,
+            effects=(),
         )

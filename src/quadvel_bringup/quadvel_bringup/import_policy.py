@@ -23,7 +23,7 @@ def import_command(
         typer.Option(
             "--with",
             metavar="<file>",
-            help="unitree_rl_lab's deploy.yaml, or rl_sar's config.yaml next to or below its base.yaml.",
+            help="unitree_rl_lab's deploy.yaml, or rl_sar's config.yaml, with base.yaml in its folder or the one above.",
             show_default="mjlab's metadata in the ONNX file",
         ),
     ] = None,
@@ -46,7 +46,7 @@ def import_command(
 ) -> None:
     """Import a policy of unitree_rl_lab, rl_sar or mjlab into one ONNX file.
 
-    A field that is missing or does not fit is refused by name.
+    A field that is missing or does not fit ends the command with an error that names it.
 
     \b
     For example:

@@ -1,4 +1,4 @@
-"""Indices of child processes that end together, and signals that stop a command.
+"""Groups of child processes that end together, and signals that stop a command.
 
 It does not restart processes.
 """
@@ -27,8 +27,8 @@ class ProcessGroup:
     """Starts processes, forwards their output, and leaves none running.
 
     Each process runs in its own session, so that Ctrl-C reaches it once, through `stop`. It starts
-    with SIGINT blocked until it is ready to end cleanly, as nodes are after their start. If this
-    process is killed, the kernel sends them SIGTERM.
+    with SIGINT blocked, and unblocks it when it can end cleanly (a node: after its start). If this
+    process is killed, the kernel sends SIGTERM to its children.
 
     Args:
         output: Receives name and line.
@@ -124,9 +124,9 @@ class StopSignals:
     """Catches SIGINT, SIGTERM and SIGHUP within the block and notes them instead of raising.
 
     Enter it in the main thread, outside of a `ProcessGroup`, so that a second Ctrl-C does not abort
-    its clean-up. A SIGINT that was blocked before arrives inside the block. After the block SIGINT
-    is blocked and ignored if it was before, or if a signal arrived, also in threads started inside:
-    the process is about to end.
+    its clean-up. A SIGINT that was blocked before arrives inside the block. Where SIGINT was blocked
+    before, or a signal arrived, it stays blocked and ignored after the block, also in threads that
+    were started inside: the process is about to end.
 
     Attributes:
         received: Number of the first signal, or None.

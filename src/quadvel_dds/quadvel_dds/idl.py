@@ -1,7 +1,7 @@
 """Cyclone DDS types of the messages.
 
-Cyclone checks received samples against these types, so malformed data are dropped. The content
-passes as CDR bytes, which `messages` writes and reads.
+Cyclone drops received samples that do not fit these types. The stack keeps the bytes of a sample
+(CDR), which `messages` writes and reads.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from rosbags.interfaces import Nodetype
 
 from quadvel_dds import messages
 
-types: Any = idl_types  # its subscripts are made at run time
+types: Any = idl_types  # mypy does not know types.array[...]
 BASE = {"bool": bool, "char": types.uint8, "string": str}
 REQUEST_HEADER = {"client_guid_": types.uint64, "sequence_number_": types.int64}
 

@@ -1,4 +1,4 @@
-"""A robot as one value: `load_robot("aliengo")` reads its folder, and the value is passed on.
+"""One `Robot` holds all numbers of a robot: `load_robot("aliengo")` reads its folder.
 
 The folder of a robot, `robots/<name>` or one elsewhere, holds
 
@@ -166,7 +166,7 @@ class LegGeometry:
     Attributes:
         hips: Hip joints in the trunk frame, (4, 3), m.
         lateral: Thigh joint to the left of the hip joint, (4,), m.
-        links: Thighs and calves along z if all angles are zero, (2,), m, negative.
+        links: z of the vectors along thigh and calf if all angles are zero, (2,), m, negative.
         thigh: Length of the thighs, m.
         calf: Length of the calves to the centre of the foot sphere, m.
         knees: Sign of the calf angle in the nominal posture, (4,); -1: the knee bends backward.
@@ -284,7 +284,7 @@ class Robot:
         return _height(self, self.lie_q)
 
     def __attrs_post_init__(self) -> None:
-        """Refuse postures out of range, and limits or postures that are not left-right symmetric."""
+        """Refuse postures and command limits out of range, and postures that are not left-right symmetric."""
         for name in ("nominal_q", "lie_q", "command_lower", "command_upper"):
             q = getattr(self, name)
             if (outside := (q < self.lower) | (q > self.upper)).any():

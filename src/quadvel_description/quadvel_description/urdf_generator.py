@@ -38,7 +38,7 @@ def _rpy(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _add_inertial(link: Element, body: mujoco.MjsBody) -> None:
-    """Add the inertia of a body, which its MJCF states in the axes of the body."""
+    """Add the inertia of a body; its MJCF must state it in the axes of the body."""
     full = body.fullinertia if np.isfinite(body.fullinertia[0]) else [*body.inertia, 0.0, 0.0, 0.0]
     node = ElementTree.SubElement(link, "inertial")
     ElementTree.SubElement(node, "origin", xyz=_text(*body.ipos), rpy="0 0 0")

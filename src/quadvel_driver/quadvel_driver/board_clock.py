@@ -13,10 +13,12 @@ import attrs
 
 COUNTER_UNITS_S = (1e-3, 1e-6)  # possible units of the counter
 UNIT_WINDOW_S = 0.1  # length of the record from which the unit is identified
-MAX_RATE_RATIO = 10.0  # largest ratio of counter rate and nominal rate
+MAX_RATE_RATIO = 10.0  # largest ratio of counter rate and nominal rate, either way
 OFFSET_WINDOW = 32  # states; the one with the least delay gives the offset of the clocks
-MAX_DELAY_JUMP_S = 0.01  # longer than any network delay: the board (a simulated one) stood still
-RESTART_TIMEOUT_S = 0.1  # without a newer state, after which an older counter means a board restart
+MAX_DELAY_JUMP_S = 0.01  # an arrival so much later than the fastest one means that a simulated board paused
+RESTART_TIMEOUT_S = (
+    0.1  # time without a newer state from which on an older counter means that the board restarted
+)
 MIN_TIME_STEP_S = 1e-6  # least time between two states
 _COUNTER_MODULUS = 2**32
 

@@ -33,7 +33,7 @@ from .recording import planar
 MAX_POINTS_PER_LINE = 4000  # more are invisible
 LOOP_QUANTITIES = {
     "rate_hz": "rate, Hz",
-    "compute_p99_us": "computing, 99 %, us",
+    "compute_p99_us": "99th percentile of computing time, us",
     "overruns": "deadlines missed",
 }
 MODE_COLOURS = {
@@ -81,7 +81,7 @@ class RecordedRun:
         series: Times since `begin` (n,), s, and values (n, k) of each recorded topic.
         modes: Start (s) and name of each mode of the controller, in order.
         end: Last time of all topics, s since `begin`.
-        joints: Joints whose angles, then torques, are the values of low_state.
+        joints: Joints of the series of low_state, which holds their angles, then their torques.
         uses_receipt_times: Whether times of receipt replace missing stamps.
         foreign_log: Joint log of another robot, if the joints come from one.
         robot: The robot that the recording names.

@@ -1,4 +1,4 @@
-"""What a process of the control loop costs at least; `live_bench` runs both together with the stack.
+"""Two lower bounds of what the control loop costs; `live_bench` runs both together with the stack.
 
 `python -m quadvel_lab.live_floor` is the node `floor`: it takes each `low_state`, runs the policy's
 network once, and writes `floor/low_cmd`. Nothing else. `... live_floor SECONDS` sleeps for one

@@ -1,6 +1,6 @@
 """The robot on standard ROS topics, for RViz, Foxglove and Nav2. Needs rclpy.
 
-A node that serves `low_state` (simulator or driver) also publishes joint angles and IMU data as
+A node that publishes `low_state` (simulator or driver) also publishes joint angles and IMU data as
 sensor_msgs, the transforms of the links, and the robot description.
 """
 

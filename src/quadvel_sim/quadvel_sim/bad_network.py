@@ -80,7 +80,8 @@ class BadNetwork:
             now: Present time, s.
         """
         config = self._config
-        # Always six uniform draws a packet, so that one kind of fault does not change the others:
+        # Always six uniform draws a packet, so that loss, duplicates, reordering and jitter do not
+        # change each other:
         # arrival = now + delay + reordering + jitter * U(0, 1), with one jitter for each copy.
         loss, duplicate, reorder, corrupt, *jitters = self._rng.random(6)
         if loss < config.network_loss:

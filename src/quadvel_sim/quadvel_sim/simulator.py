@@ -70,6 +70,12 @@ class Truth:
     contact_force: _Array
 
 
+MAX_PUSH_WEIGHTS = 10.0
+"""Largest force of all pushes together, in weights of the robot; some 50 make the physics diverge."""
+MAX_PUSH_ARM_M = 0.2
+"""Largest torque of all pushes together, in weights of the robot times 1 m; 0.5 m make it diverge."""
+
+
 @attrs.define
 class _Push:
     """A push that is under way."""
@@ -312,8 +318,8 @@ class Simulator:
             duration: Duration, s.
 
         Raises:
-            ValueError: The body is unknown, the wrench is not finite, or the duration is below 1
-                ms.
+            ValueError: The body is unknown, the wrench is not finite, the duration is below 1 ms, or
+                all present pushes together exceed MAX_PUSH_WEIGHTS or MAX_PUSH_ARM_M.
         """
         bodies = [self.model.body(i).name for i in range(1, self.model.nbody) if self.model.body_weldid[i]]
         if body not in bodies:
@@ -323,8 +329,22 @@ class Simulator:
             raise ValueError(f"push: wrench: found {wrench.tolist()}, expected 3 and 3 finite numbers")
         if not (np.isfinite(duration) and duration >= DT):
             raise ValueError(f"push: duration: found {duration} s, expected at least {DT} s")
+        self._check_size(wrench)
         self._pushes.append(_Push(self.model.body(body).id, wrench, max(1, round(duration / DT))))
         self._apply_pushes()
+
+    def _check_size(self, wrench: _Array) -> None:
+        """Refuse a push with which all present ones are so large that the physics could diverge."""
+        wrenches = np.array([wrench, *(push.wrench for push in self._pushes)]).reshape(-1, 2, 3)
+        force, torque = np.linalg.norm(wrenches, axis=2).sum(axis=0)
+        weight = float(self.model.body_subtreemass[1] * np.linalg.norm(self.model.opt.gravity))
+        for name, total, limit, unit in (
+            ("force", force, MAX_PUSH_WEIGHTS * weight, "N"),
+            ("torque", torque, MAX_PUSH_ARM_M * weight, "N m"),
+        ):
+            if total > limit:
+                found = f"found {total:.4g} {unit} of all pushes together"
+                raise ValueError(f"push: {name}: {found}, expected at most {limit:.4g}")
 
     def fail_joint(self, name: str) -> None:
         """Switch off a drive until the next reset: its torque, also the measured one, is zero.

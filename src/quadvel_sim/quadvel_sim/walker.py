@@ -17,7 +17,7 @@ from quadvel_description.arrays import Array
 STANCE_FRACTION = 0.6
 """Share of a stride in which a foot stands."""
 SHIN_SWING_RATIO = 0.75
-"""Amplitude of the shin at the height of the laser by the amplitude of the foot."""
+"""Amplitude of the shin at the height of the laser, divided by that of the foot."""
 SWING_TIME_CONSTANT_S = 0.2
 """Time constant with which the amplitude follows a change of speed."""
 
@@ -77,8 +77,8 @@ class Walker:
         )
         speed = 0.0 if standing else self.speed * (1.0 + self.pace * np.sin(1.3 * self.time))
         self.travelled += speed * dt
-        # Stride period T(v) = 1.5 s - 0.3 v. A foot on the ground moves by -v relative to the body,
-        # so its amplitude is half of v T times the stance fraction.
+        # Stride period T(v) = 1.5 s - 0.3 v. A foot on the ground moves at -v relative to the body,
+        # so its amplitude is v T STANCE_FRACTION / 2.
         period = 1.5 - 0.3 * min(speed, 2.0)
         self.swing += (0.5 * STANCE_FRACTION * speed * period - self.swing) * min(
             1.0, dt / SWING_TIME_CONSTANT_S

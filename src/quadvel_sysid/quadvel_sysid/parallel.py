@@ -1,7 +1,7 @@
 """Parallel map over forked worker processes, with the results of a serial run.
 
-A worker is a fork of this process and therefore has its data. Results return by pickle, in which a
-name replaces the object `shared`: both processes have it.
+A worker is a fork of this process and therefore has its data. Results return by pickle. The
+object `shared` is not pickled, because both processes have it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def parallel_map(work: Callable[[int], Result], count: int, cores: int, shared: 
     queue = _task_queue(count)
     workers = []
     try:
-        # One after the other, so that a failure finds those already started in the list.
+        # One by one, so that the clean-up finds those already started.
         for _ in range(min(cores, count) - 1):
             workers.append(_Worker(work, queue, shared))  # noqa: PERF401
         found = {k: work(k) for k in _claim_tasks(queue)}
@@ -124,17 +124,22 @@ def _run_worker(work: Callable[[int], Any], queue: int, writer: int, shared: obj
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # end with the parent
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPT_SIGNALS)
-        sys.stdout = sys.stderr = None  # the fork may have copied their locks locked
+        sys.stdout = sys.stderr = None  # at the fork another thread may have held their locks
         try:
-            found: Any = {k: work(k) for k in _claim_tasks(queue)}
+            answer = _pickled({k: work(k) for k in _claim_tasks(queue)}, shared)
         except Exception as error:
-            found = error
-        answer = io.BytesIO()
-        _Pickler(answer, shared).dump(found)
+            answer = _pickled(error, shared)
         with os.fdopen(writer, "wb") as file:
-            file.write(answer.getvalue())
+            file.write(answer)
     finally:
         os._exit(0)
+
+
+def _pickled(value: Any, shared: object) -> bytes:
+    """Pickle a value, which may hold the shared object."""
+    buffer = io.BytesIO()
+    _Pickler(buffer, shared).dump(value)
+    return buffer.getvalue()
 
 
 class _Pickler(pickle.Pickler):

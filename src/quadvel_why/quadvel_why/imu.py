@@ -22,13 +22,15 @@ from quadvel_description.kinematics import rotate, rotate_inverse
 from .run import Run
 
 WINDOW_S = 0.05
-"""Of a turn: longer than the noise of the orientation, shorter than a step."""
+"""Window of a turn: so long that the noise of the orientation is small, and shorter than a step."""
 VERTICAL_WINDOW_S = 0.4
-"""Of the mean acceleration: longer than a step."""
+"""Window of the mean acceleration: longer than a step."""
 TURN_SCALE_RAD, VERTICAL_SCALE_RAD = 0.01, 0.1
-"""Errors that weigh alike; ten times what a healthy walk shows."""
+"""Errors of turn and vertical that count alike, ten times what a healthy walk shows."""
 CLEARLY_BETTER = 1.5
-"""Factor by which a convention of one sensor has to fit better than all of the other to be told apart."""
+"""The best reading of one sensor must fit better by this factor than the best of the other one; else the
+diagnosis is ambiguous.
+"""
 DEGREES = 180.0 / np.pi
 QUATERNIONS: Mapping[str, Callable[[Array], Array]] = {
     "w, x, y, z": lambda q: q,
@@ -112,7 +114,7 @@ class ImuHypotheses:
 
     @cached_property
     def best(self) -> Hypothesis:
-        """The hypothesis that fits best; only one of both sensors deviates."""
+        """The hypothesis that fits best; only one sensor deviates from the usual convention."""
         return min(self._best_quaternion, self._best_gyroscope, key=attrgetter("error"))
 
     @property

@@ -188,7 +188,7 @@ class Wave(Shape):
 
 @attrs.frozen(eq=False)
 class Filter(Shape):
-    """Finite impulse response: the signal, and its means over past windows minus its present value.
+    """Finite impulse response: the signal and, for each past window, its mean there minus its present value.
 
     Attributes:
         edges: s, ages that bound the windows.
@@ -290,7 +290,7 @@ class Lag(Shape):
 
 @attrs.frozen(eq=False)
 class Resonance(Shape):
-    """The signal, and position and velocity of a damped oscillator that it drives.
+    """The signal, and both parts of the state of a damped oscillator that it drives.
 
     Attributes:
         frequency: Hz, undamped natural frequency.
@@ -309,8 +309,9 @@ class Resonance(Shape):
 
     def _discretised(self, dt: float) -> tuple[complex, complex]:
         """Return factor and gain of one step."""
-        # Complex form of z'' + 2 damping w z' + w^2 z = w^2 u, with w = 2 pi frequency:
-        #     dz/dt = l z + |l| u, l = w (-damping + i sqrt(1 - damping^2))
+        # Complex form of x'' + 2 damping w x' + w^2 x = w^2 u, with w = 2 pi frequency:
+        #     dz/dt = l z + |l| u, l = w (-damping + i sqrt(1 - damping^2)),
+        #     Re z = x' / w + damping x, Im z = sqrt(1 - damping^2) x
         #     z(t + dt) = exp(l dt) z + |l| (exp(l dt) - 1) / l u
         size = 2.0 * np.pi * self.frequency
         pole = size * complex(-self.damping, np.sqrt(1.0 - self.damping**2))

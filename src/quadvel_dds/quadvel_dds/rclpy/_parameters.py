@@ -1,4 +1,4 @@
-"""Parameters of a node: declaration, overrides, and services. A part of `Node`."""
+"""Parameters of a node: declaration, overrides, and services. A base class of `Node`."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class ParameterMixin(Partial):
         return names if all(name in self._parameters for name in names) else []
 
     def _on_list(self, request: Any, response: Any) -> Any:
-        """List names below the prefixes (none: all), at most `depth` parts below (0: any)."""
+        """List the names below given prefixes, at most `depth` parts below; [] and 0 mean all."""
         response.result = result = ListParametersResult()
         for name in self._parameters:
             below = [name[len(p) + 1 :] for p in request.prefixes if name.startswith(f"{p}.")]

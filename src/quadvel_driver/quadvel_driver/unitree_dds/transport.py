@@ -48,15 +48,15 @@ class DdsConfig(LinkConfig):
 class DdsTransport(Transport):
     """Reads states and writes commands; watches for other writers of commands.
 
-    The writer is created by `claim` only, because other programs take any writer of `rt/lowcmd` for
-    one that commands the joints.
+    The writer is created by `claim` only, because other programs assume that any writer of
+    `rt/lowcmd` commands the joints.
     """
 
     def __init__(self, bus: Bus) -> None:
         """Read the robot's states.
 
         Args:
-            bus: The robot's bus; `close` leaves it.
+            bus: The robot's bus; `close` closes it.
         """
         self.board, self.counts = bus.name, Counter()
         self._bus = bus

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from cyclonedds.idl import IdlStruct, make_idl_struct, types
 
-_Array: Any = types.array  # its subscripts are made at run time
+_Array: Any = types.array  # mypy does not know types.array[...]
 _BYTE, _WORD, _FLOAT = types.uint8, types.uint32, types.float32
 
 

@@ -1,4 +1,4 @@
-"""Reads a recorded run of the follow nodes as samples of a tour."""
+"""Reads a recorded walk behind a person as the samples of `following.tour`."""
 
 from __future__ import annotations
 

@@ -222,7 +222,6 @@ class Outcome:
     """Outcome of a walk behind a person, without its samples.
 
     Attributes:
-        robot: Name of a shipped robot, or path of a robot.yaml.
         world: Name of the world.
         seed: Seed of the run.
         distance: Set distance to the person, m.

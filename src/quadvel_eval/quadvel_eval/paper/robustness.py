@@ -54,7 +54,7 @@ class Robustness(Section):
     """Walks of every command under every condition.
 
     Attributes:
-        groups: Indices of conditions.
+        groups: Groups of conditions.
         commands: vx, vy (m/s), wz (rad/s) of each walk.
     """
 
@@ -84,7 +84,7 @@ class Robustness(Section):
         return [cell_record(labels, result) for labels, result in answers]
 
     def _shown(self, records: Sequence[Record]) -> list[str]:
-        """Indices of this section that the records hold."""
+        """Groups of this section that the records hold."""
         return [group for group in distinct(records, "group") if group in self.groups]
 
     @override

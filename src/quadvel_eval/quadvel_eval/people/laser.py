@@ -1,6 +1,6 @@
 """Simulates a laser scanner in a floor plan: rays against circles and segments, with sensor noise.
 
-It serves tests, training and the check of other simulated lasers, not dynamics.
+Tests, training and the check of other simulated lasers use it; the physics simulation does not.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Guards of the messages with states, and of the process that answers them. No ROS.
 
-`guard` runs the guards; the supervisor acts on what they find.
+`guard.GuardSet` runs them; the supervisor acts on what they find.
 """
 
 from __future__ import annotations
@@ -76,8 +76,10 @@ class ControllerStopped(Guard):
 
 
 class StateStale(Guard):
-    """The state is older than `max_state_age`, or no valid state came for so long; `max_standstill`
-    if the process of a simulated robot, whose time stands still then, is silent.
+    """The state is older than `max_state_age`, or no valid state came for so long.
+
+    For a simulated robot that falls silent the limit is `max_standstill`, as its time then stands
+    still.
     """
 
     @override
@@ -108,7 +110,7 @@ class StateFrozen(Guard):
 
 
 class Overruns(Guard):
-    """More than `max_overruns` consecutive deadlines were missed (on a robot; a simulated one waits)."""
+    """More than `max_overruns` consecutive deadlines were missed (on a real robot; a simulated one waits)."""
 
     level = Level.STANCE
 

@@ -1,6 +1,6 @@
 """Guards of the trunk: its tilt, and the IMU. No ROS.
 
-`guard` runs the guards; the supervisor acts on what they find. Angles are in rad, rates in rad/s.
+`guard.GuardSet` runs them; the supervisor acts on what they find. Angles are in rad, rates in rad/s.
 """
 
 from __future__ import annotations

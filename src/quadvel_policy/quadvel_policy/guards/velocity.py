@@ -1,6 +1,6 @@
 """Guards of the velocity of the trunk, which the policy needs. No ROS.
 
-`guard` runs the guards; the supervisor replaces a rejected estimate by `backup_velocity`.
+`guard.GuardSet` runs them; the supervisor replaces a rejected estimate by `backup_velocity`.
 Velocities are in the body frame, m/s.
 """
 

@@ -1,4 +1,4 @@
-"""Compiled interpolation of time series; an identification reads logs at thousands of delays.
+"""Compiled interpolation of time series; one identification needs thousands of interpolations.
 
 `log_signals` is the only user; it decides which series to read and at what times.
 """
@@ -14,7 +14,7 @@ import numpy as np
 from quadvel_description.arrays import Array, Indices
 
 _MAX_LINEAR_STEPS = 16
-"""Indices of linear search before binary search."""
+"""Steps of linear search before binary search."""
 
 
 def rows_at(times: Array, at: Array) -> Indices:
@@ -86,7 +86,7 @@ def hold_integral(values: Array, sums: Array, times: Array, at: Array) -> Array:
 
     Args:
         values: (K, J) values, each in force from its time to the next.
-        sums: (K + 1, J) integral at the time of each row.
+        sums: (K + 1, J) integral at the time of each row, and far after the last one.
         times: (K,) times of the rows, s.
         at: (N,) times, s.
 

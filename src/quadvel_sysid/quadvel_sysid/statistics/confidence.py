@@ -51,7 +51,7 @@ class InseparablePair:
 
     @property
     def conditional(self) -> float:
-        """Ratio of the first parameter's half width if the second one is known to that if not."""
+        """Half width of the first parameter if the second one is known, divided by that if it is not."""
         return float(np.sqrt(max(1.0 - self.correlation**2, 0.0)))
 
 
@@ -77,13 +77,13 @@ class Intervals:
 
 
 def intervals(model: Model, parts: DataSplit, noise: Array, clock_offsets: Sequence[float] = ()) -> Intervals:
-    """Compute confidence intervals of a model that was fitted to the rows that fit or select.
+    """Compute confidence intervals of a model that was fitted to the fit and selection rows.
 
     Args:
         model: The fitted model.
         parts: Data split with the clusters.
         noise: Variance of the torque noise, (J,), N^2 m^2.
-        clock_offsets: Offsets of the recordings' commands, s, whose spread widens the interval of the
+        clock_offsets: Offsets of the recordings' commands, s; the largest widens the interval of the
             input delay.
 
     Returns:
@@ -100,7 +100,7 @@ def intervals(model: Model, parts: DataSplit, noise: Array, clock_offsets: Seque
     for index, effect in enumerate(model.effects):
         own = random_error[first : first + len(effect.values)]
         first += len(effect.values)
-        # Some effects know the sampling error of their parameters, which replaces that of the slopes.
+        # Some effects compute the random error of their parameters themselves.
         candidate = effect.candidate
         known = candidate.sampling_error(effect.parameters, model.signals)
         sampling = np.array([known.get(name, row) for name, row in zip(candidate.names, own, strict=True)])
@@ -112,7 +112,7 @@ def intervals(model: Model, parts: DataSplit, noise: Array, clock_offsets: Seque
     # A half width as large as the gain (or 1) means that any gain from 0 on is possible.
     size = np.abs(model.gains)
     gains = np.minimum(random_error[:2] + _SYSTEMATIC_GAIN_FRACTION * size, np.maximum(1.0, size))
-    # Input delays may be anywhere in the flat valley of the error, and so may the sum of both.
+    # The error is flat about the best input delay: the interval holds all of that valley.
     both = covariance.half_widths(np.eye(len(covariance.index))[-2:].sum(axis=0, keepdims=True))
     delays = np.concatenate([random_error[-2:], both]) + _CLOCK_ERROR_S
     flat = delay_flatness(model, rows) + _CLOCK_ERROR_S
