@@ -75,3 +75,28 @@ def test_ctrl_c_while_the_interpreter_ends_changes_nothing(
     )
     assert ended.returncode == code, ended.stderr  # nobody is there
     assert "Traceback" not in ended.stderr
+
+
+DROPPED_BY_PYTHON = """
+import signal, time, typer, weakref
+from quadvel_bringup import __main__, cli
+class Thing: pass
+app = typer.Typer()
+@app.command()
+def work():
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    thing = Thing()
+    reference = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGINT))
+    del thing
+    time.sleep(60.0)
+cli.app = app
+__main__.main([])
+"""
+
+
+def test_ctrl_c_in_the_callback_of_a_weak_reference_ends_a_command() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", DROPPED_BY_PYTHON], stderr=subprocess.PIPE, text=True, timeout=40
+    )
+    assert ended.returncode == 130, ended.stderr
+    assert "Traceback" not in ended.stderr

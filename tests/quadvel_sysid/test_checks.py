@@ -94,6 +94,13 @@ def test_finding_names_the_joint_with_the_defect() -> None:
     assert "kp: 0 at times on FR_thigh_joint alone; left out there" in texts(found, "warning")
 
 
+def test_gains_that_the_log_holds_are_kept_with_a_warning() -> None:
+    checked = check_log(log(), gains=(300.0, 0.5))
+    assert texts(checked, "warning") == ["kp, kd: the log holds them, so --gains is not used"]
+    assert checked.log.kp is not None
+    assert checked.log.kp.max() == 30.0
+
+
 def test_clean_log_yields_only_its_rate() -> None:
     checked = check_log(log())
     assert texts(checked, "warning") == []

@@ -169,8 +169,9 @@ def test_the_command_writes_the_finding_and_ends_with_1(run: Run, tmp_path: Path
     now = np.maximum(run.command_rows(0.0), 0)[rows]
     log |= {"q_des": run.commands.q[now], "kp": run.commands.kp[now], "kd": run.commands.kd[now]}
     np.savez(tmp_path / "log.npz", **log)
-    with pytest.raises(SystemExit) as ended:
-        cli.command("why").main([str(tmp_path / "log.npz"), "--out", str(tmp_path / "out")])
+    arguments = [str(tmp_path / "log.npz"), "--out", str(tmp_path / "out"), "--gains", "3", "0.1"]
+    with pytest.raises(SystemExit) as ended, pytest.warns(UserWarning, match="so --gains is not used"):
+        cli.command("why").main(arguments)
     assert ended.value.code == 1
     told = json.loads((tmp_path / "out" / "why.json").read_text())
     assert told["finding"]["cause"]

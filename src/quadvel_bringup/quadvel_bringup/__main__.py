@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
+import threading
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 from .error_sentence import exit_with_sentence
 
 STOPPED = tuple(128 + number for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM))
 """Exit codes of a command that a signal ended."""
+REPEAT_AFTER_S = 0.05
+"""Time after which a Ctrl-C that was dropped is repeated."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -26,7 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     from .cli import app
 
-    warnings.showwarning = _show_warning
+    warnings.showwarning, former = _show_warning, sys.unraisablehook
+    sys.unraisablehook = _repeat_dropped_interrupt
     try:
         with exit_with_sentence("quadvel"):
             # Shell completion needs this name, however quadvel was started.
@@ -36,6 +42,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process ends now; ignore further Ctrl-C
             print("quadvel: stopped; no file was left half-written", file=sys.stderr)
         raise
+    finally:
+        sys.unraisablehook = former
+
+
+def _repeat_dropped_interrupt(dropped: Any) -> None:
+    """Repeat a Ctrl-C that Python dropped, as it does in the callback of a weak reference."""
+    if issubclass(dropped.exc_type, KeyboardInterrupt):
+        threading.Timer(REPEAT_AFTER_S, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(dropped)
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

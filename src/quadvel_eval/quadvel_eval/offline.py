@@ -30,7 +30,7 @@ from quadvel_nodes.messages import MessageError, read_low_state
 from quadvel_nodes.number_text import number_text
 from quadvel_nodes.stall_free_clock import StallFreeClock
 from quadvel_recordings.output import atomic_write, output_folder
-from quadvel_recordings.reading import RecordingError, read_messages
+from quadvel_recordings.reading import RecordingError, read_messages, warn_of_unused_gains
 
 from .demo_figures import AXIS_LABELS
 from .recording_plot import (
@@ -257,6 +257,8 @@ def replay_command(
     model = ActuatorParameters.of(chosen) if actuator is None else ActuatorParameters.load(chosen, actuator)
     asked = LearnedEstimator(chosen, estimator_file) if estimator == "learned" else KalmanEstimator(chosen)
     if run.foreign_log is None:
+        if gains is not None:
+            warn_of_unused_gains(recording)
         joints = read_joints(recording, MAX_STATE_PERIOD_S, run.uses_receipt_times)
     else:
         joints = joints_from_log(recording, run.foreign_log, MAX_STATE_PERIOD_S, gains)

@@ -24,7 +24,7 @@ from quadvel_nodes.messages import seconds
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_recordings.joint_log import JointLog, Series, require_commands
-from quadvel_recordings.reading import read_messages
+from quadvel_recordings.reading import read_messages, warn_of_unused_gains
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.simulator import DT, Simulator, Truth
 
@@ -152,6 +152,8 @@ def joints_from_log(
     speed = values.get("dq", np.gradient(values["q"], state.time, axis=0))
     ticks, first = np.unique(np.round(1e3 * state.time).astype(int), return_index=True)
     sent = {name: _in_model_order(path, command, each) for name, each in command.values.items()}
+    if gains is not None and {"kp", "kd"} <= sent.keys():
+        warn_of_unused_gains(path)
     for name, gain in zip(("kp", "kd"), gains or (None, None), strict=True):
         if name not in sent and gain is None:
             raise ValueError(f"{path}: {command.topic}: {name}: not in the recording, expected --gains KP KD")

@@ -324,3 +324,12 @@ def _recovered_messages(
     for one in recover_messages(path):
         if wanted(one.topic, one.typename) and is_known(one.typename, one.definition):
             yield one.topic, one.time, partial(_deserialize, one.data, one.typename, one.definition)
+
+
+def warn_of_unused_gains(path: Path | str) -> None:
+    """Warn that a recording holds its gains, so that those given with --gains are not used.
+
+    Args:
+        path: The recording.
+    """
+    warnings.warn(f"{path}: kp, kd: the commands hold them, so --gains is not used", stacklevel=3)

@@ -19,7 +19,13 @@ from quadvel_description.robot_name import described_robot
 from quadvel_description.state import MODE_DAMPING
 from quadvel_eval.recording import Series, planar
 from quadvel_nodes.messages import seconds
-from quadvel_recordings.reading import RecordingError, read_messages, recorded_description, topics
+from quadvel_recordings.reading import (
+    RecordingError,
+    read_messages,
+    recorded_description,
+    topics,
+    warn_of_unused_gains,
+)
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.logs.read_log import read_log
 from quadvel_sysid.logs.readers.columns import ColumnMap
@@ -71,11 +77,15 @@ def read_run(
     is_recording = path.suffix in RECORDINGS or path.is_dir()
     types = topics(path) if is_recording else {}
     if STATE in types.values():
+        if gains is not None:
+            warn_of_unused_gains(path)
         named = described_robot(recorded_description(path))
         return _own_run(path, robot_of_file(path, named, robot), types)
     log = read_log(path, names=names, topics=topics_of_log, robot=robot)
     if gains is None and (log.kp is None or log.kd is None):
         raise RecordingError(f"{path}: kp, kd: the commands hold no gains, expected --gains KP KD")
+    if log.holds_other_gains(gains):
+        warn_of_unused_gains(path)
     return _run_of_log(log.with_gains(gains), _others_imu(path, types, log))
 
 

@@ -53,8 +53,11 @@ def check_log(log: Log, gains: tuple[float, float] | None = None) -> CheckedLog:
     Returns:
         The corrected log and the findings.
     """
+    unused = log.holds_other_gains(gains)
     log = log.with_gains(gains)
     findings = [Finding("note", text.partition(":")[0], (), text) for text in log.remarks]
+    if unused:
+        findings.append(Finding("warning", "kp", (), "kp, kd: the log holds them, so --gains is not used"))
     findings += [Finding("warning", text.partition(":")[0], (), text) for text in log.warnings]
     for check in ROW_CHECKS:
         log = _run_check(check, findings, log)

@@ -173,6 +173,22 @@ class Log:
         tau = self.tau - np.sum(asked, axis=0)[self.command_rows(self.t)]
         return attrs.evolve(self, tau=tau, tau_ff=None, dq_des=self.dq_des if speed is None else None)
 
+    def holds_other_gains(self, gains: tuple[float, float] | None) -> bool:
+        """Return whether `with_gains` would not use given gains, because the log has others.
+
+        Args:
+            gains: kp (N m/rad) and kd (N m s/rad), or None.
+
+        Returns:
+            True if the log has both gains, and at least one differs from the given one.
+        """
+        logged = (self.kp, self.kd)
+        return (
+            gains is not None
+            and all(one is not None for one in logged)
+            and any(np.any(one != gain) for one, gain in zip(logged, gains, strict=True))
+        )
+
     def with_gains(self, gains: tuple[float, float] | None) -> Log:
         """Fill in the commanded gains that the log does not hold.
 
