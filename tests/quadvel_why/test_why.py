@@ -16,6 +16,7 @@ from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import Diagnosis, diagnose
 from quadvel_why.links import CAUSES
 from quadvel_why.links.drives import SpeedTorqueLimit, TorqueLimit
+from quadvel_why.links.ground import Payload
 from quadvel_why.page import page
 from quadvel_why.reading import read_run
 from quadvel_why.report import summary
@@ -125,6 +126,15 @@ def test_a_changed_recording_is_named_by_what_was_changed(name: str, run: Run) -
     assert found.cause.name() == name, found.measurement.sentence
     assert found.measurement.value > found.limit
     assert found.measurement.traces
+
+
+def test_a_robot_whose_feet_carry_nothing_hangs_and_is_not_weighed(run: Run) -> None:
+    assert run.tau is not None
+    policy = PolicyFile(ALIENGO)
+    heavy = Payload().measure(Signals(attrs.evolve(run, tau=1.6 * run.tau), policy))
+    assert heavy is not None
+    assert heavy.value > 1.0
+    assert Payload().measure(Signals(attrs.evolve(run, tau=0.1 * run.tau), policy)) is None
 
 
 def test_a_robot_that_stood_for_a_moment_has_no_weak_drive(run: Run) -> None:

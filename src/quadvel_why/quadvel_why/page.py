@@ -19,7 +19,8 @@ PAGE = """\
 # Why did it fail? From a recording to its cause
 
 `quadvel why` reads the recording of a run that failed and names the first link that breaks in the
-chain contract, timing, sensors, estimator, drives, ground, task:
+chain contract, timing, sensors, estimator, drives, ground, task. The contract is what robot, driver
+and controller have to agree on: order, sign, zero, unit and frame of all values.
 
     quadvel record --out fall.mcap       # while it happens; Ctrl-C stops
     quadvel why fall.mcap                # names the cause; writes out/why/why.json and why.png
@@ -35,37 +36,40 @@ chain contract, timing, sensors, estimator, drives, ground, task:
 | 1 | a link breaks; it is named |
 | 2 | a wrong argument or file |
 
-The answer is one cause: the first that is found. Later ones may be its consequences, so they are not
-examined. Repair it, record again and ask again. If two causes look the same in the recording, both
-are named, with the experiment that distinguishes them.
+The answer is one cause: the first that is found. Later ones may be its consequences, so they are
+not examined. Repair it, record again and ask again. If two causes look the same in the recording,
+both are named, with the experiment that distinguishes them.
 
-A recording of this stack holds everything that the causes need. In `LowState` and `LowCmd` of another
-robot, and in a table, kinematics and policy are missing. The causes that need them are then not
-examined, and the answer lists them.
+A recording of this stack holds everything that the causes need. In `LowState` and `LowCmd` of
+another robot, and in a table, kinematics and policy are missing. The causes that need them are then
+not examined, and the answer lists them.
 
-The limits are those of healthy walks. Other motions, such as those of `quadvel excite`, and drives with
-friction can exceed them: in a chirp, the friction of a calf was called an offset of the joint. If the
-recording reports no walk, the answer has a note; `quadvel identify` is for such logs.
+The limits are those of healthy walks. Other motions, such as those of `quadvel excite`, and drives
+with friction can exceed them: in a chirp log, the friction of a calf was wrongly named
+`joint_offset`. If the recording reports no walk, the answer has a note; `quadvel identify` is for
+such logs.
 
-A policy of another project (`quadvel policy import`) is not replayed; `--policy none` asks without
-one.
+A policy of another project (`quadvel policy import`) is not replayed; `--policy none` does
+the same for one of this project.
 
 ## How a cause is found
 
-Each cause measures one number that it cannot fake: the torque against the PD law of the commands, the
-slope of an angle against its reported speed, the turn of the orientation against the gyroscope, the
-accelerometer against the vertical, planted feet against each other and against the trunk. The policy
-is replayed on what was recorded. If its actions are not the recorded ones, other scales and orders of
-the observation are tried, another scale of the actions, older states, and a memory that was cleared.
-The right hypothesis reproduces the actions to the digit.
+Each cause is one physical check that gives a number: the torque against the PD law of the commands,
+the slope of an angle against its reported speed, the turn of the orientation against the gyroscope,
+the accelerometer against the vertical, planted feet against each other and against the trunk. The
+policy is replayed on what was recorded. If its actions are not the recorded ones, other scales and
+orders of the observation are tried, another scale of the actions, older states, and a memory that
+is cleared during the walk. The right hypothesis reproduces the actions to the digit.
 
-A cause is found if its number exceeds its limit. This is the smallest number that is worth naming, or
-1.5 times the largest number of {healthy} healthy walks if that is more, or the range of the training
-(delay, load, slope). The walks of the limits have other seeds and plants than those of the test. With
+A cause is found if its number exceeds its limit. For delay, load and slope this is the range of the
+training. For all others it is the smallest number that is worth naming, or 1.5 times the largest
+number of {healthy} healthy walks if that is more. The walks that set the limits differ from those of
+the test in seed and simulated robot. With
 no false alarm in n walks, the rate of false alarms is below 3 / n at a confidence of 95 %.
 
-`python -m benchmarks.why.score` measures the diagnosis on walks with hidden defects, injected by code
-that shares nothing with it ([results](results/why.md)). `python -m quadvel_why.page` prints this page.
+`python -m benchmarks.why.score` measures the diagnosis on walks with hidden defects, injected by
+code that shares nothing with it ([results](results/why.md)). `python -m quadvel_why.page` prints
+this page.
 
 {tables}
 """

@@ -24,6 +24,8 @@ MIN_WEIGHING_S = 1.0
 FOUND_MASS_SHARE = 0.946
 """Share of the mass that massless legs show in the torques, on the mean of healthy walks."""
 MASS_MARGIN_KG = 0.8
+HELD_SHARE = 0.5
+"""A robot whose feet carry less than this share of its weight hangs, or is held."""
 
 
 def _loaded(legs: Legs) -> Array:
@@ -142,6 +144,8 @@ class Payload(Cause):
         total = legs.force[..., 2].sum(axis=1)
         own = signals.run.robot.mass
         mass = float(total[rows].mean()) / GRAVITY / FOUND_MASS_SHARE - own
+        if mass < -HELD_SHARE * own:
+            return None
         low, high = signals.trained.payload
         beyond = max(mass - high, low - mass, 0.0)
         expected = np.full(len(total), own * GRAVITY * FOUND_MASS_SHARE)

@@ -76,8 +76,8 @@ ROW_CHECKS = (
     ),
     Check(
         angles.exchanged_angles,
-        "correlation of dq with the slope of q_des; variance of dq that this slope leaves over that "
-        "which the slope of q leaves, on most joints that move",
+        "correlation of dq with the slope of q_des; ratio A / B of the variances of dq that the slopes of "
+        "q_des (A) and of q (B) leave; on most joints that move",
         f"{angles.EXCHANGED_CORRELATION:g}; {angles.EXCHANGED_ERROR_RATIO:g}",
         "refusal",
     ),
@@ -109,8 +109,8 @@ ROW_CHECKS = (
     ),
     Check(
         commands.constant_command,
-        "if q_des spans almost nothing of what q spans: share of the torque that a PD law about it "
-        "leaves; share of the rest that the angle explains",
+        "if q_des spans almost nothing of what q spans: share of the torque that a PD law about q_des "
+        "leaves; share of the remaining torque that q explains",
         f"{commands.MAX_HOLDING_ERROR:g}; {commands.MIN_ANSWERED_SHARE:g}",
         "left out, with a warning; on all joints, or without torque, a refusal",
     ),
