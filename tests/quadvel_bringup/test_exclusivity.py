@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from quadvel_bringup.exclusivity import running_robots, warn_beside_a_robot
+from quadvel_bringup.exclusivity import RobotAlreadyRunningError, refuse_beside_a_robot, running_robots
 
 SLEEP = "import time; print(flush=True); time.sleep(60.0)"
 
@@ -54,17 +54,14 @@ def test_a_command_that_only_starts_a_robot_is_none() -> None:
     assert robot_name(["timeout", "60", sys.executable, "-c", SLEEP, "run", "board"]) is None
 
 
-def test_a_simulator_that_starts_beside_a_robot_is_warned(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_simulator_refuses_to_start_beside_a_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", "97")
-    warn_beside_a_robot()
-    assert capsys.readouterr().err == ""
+    refuse_beside_a_robot()
     script = tmp_path / "sim_node"
     script.write_text(SLEEP)
     with subprocess.Popen([sys.executable, "-S", str(script)], stdout=subprocess.PIPE) as process:
         assert process.stdout
         assert process.stdout.readline()
-        warn_beside_a_robot()
+        with pytest.raises(RobotAlreadyRunningError, match=rf"sim_node \(pid {process.pid}"):
+            refuse_beside_a_robot()
         process.terminate()
-    assert f"sim_node (pid {process.pid}" in capsys.readouterr().err

@@ -101,6 +101,17 @@ def test_gains_that_the_log_holds_are_kept_with_a_warning() -> None:
     assert checked.log.kp.max() == 30.0
 
 
+def test_a_joint_that_moves_more_than_it_is_told_to_is_not_in_degrees() -> None:
+    rng, t = np.random.default_rng(0), fields()["t"]
+    small = 0.002 * np.sin(2 * np.pi * 0.7 * t + rng.uniform(0.0, 6.0, (12, 1))).T
+    moved = 0.12 * np.sin(2 * np.pi * 1.3 * t + rng.uniform(0.0, 6.0, (12, 1))).T
+    dq = np.gradient(moved, t, axis=0)
+    tau = 30.0 * (small - moved) - 0.5 * dq
+    assert not any(
+        "degrees" in text for text in texts(check_log(log(q=moved, dq=dq, q_des=small, tau=tau)), "refusal")
+    )
+
+
 def test_clean_log_yields_only_its_rate() -> None:
     checked = check_log(log())
     assert texts(checked, "warning") == []

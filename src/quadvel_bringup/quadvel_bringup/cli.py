@@ -267,7 +267,7 @@ def run(
 ) -> None:
     """Run one node in this process; the help is RUN_HELP."""
     from . import nodes
-    from .exclusivity import warn_beside_a_robot
+    from .exclusivity import refuse_beside_a_robot
     from .preflight import check_arguments
 
     arguments = [*context.args]
@@ -276,7 +276,7 @@ def run(
         arguments = [*(arguments or ["--ros-args"]), "-p", f"actuator_file:={file}"]
     check_arguments(node, arguments)
     if node == "sim_node":
-        warn_beside_a_robot()
+        refuse_beside_a_robot()
     nodes.run(node, arguments)
 
 

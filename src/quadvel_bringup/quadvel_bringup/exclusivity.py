@@ -6,7 +6,6 @@ Two of them would send conflicting states and commands.
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Mapping
 from itertools import dropwhile
 from pathlib import Path
@@ -37,10 +36,7 @@ def ensure_exclusive(node: Any) -> None:
         RobotAlreadyRunningError: There is a publisher; the sentence names its process.
     """
     if has_publisher(node, TOPIC, LOADED_DISCOVERY_TIME_S if robots_on_domain() else DISCOVERY_TIME_S):
-        raise RobotAlreadyRunningError(
-            f"{TOPIC}: already published on ROS domain {ros_domain()} by {describe_robots()}. Stop it, or set "
-            "ROS_DOMAIN_ID to another number"
-        )
+        raise _already_published(describe_robots())
 
 
 def describe_robots() -> str:
@@ -55,19 +51,25 @@ def describe_robots() -> str:
     return _listed(found)
 
 
-def warn_beside_a_robot() -> None:
-    """Warn on stderr before a simulator starts next to a robot of this machine and domain.
+def refuse_beside_a_robot() -> None:
+    """Refuse to start a simulator next to a robot of this machine and domain.
 
-    The simulator does not search the network: its start would take seconds longer. The controller's
-    guard does (docs/faults.md).
+    The network is not searched: the start would take seconds longer. The controller's guard finds
+    robots of other hosts (docs/faults.md).
+
+    Raises:
+        RobotAlreadyRunningError: There is such a robot; the sentence names its process.
     """
     others = {pid: name for pid, name in robots_on_domain().items() if name in PUBLISHERS}
     if others:
-        print(
-            f"quadvel: warning: {_listed(others)} publishes {TOPIC} on ROS domain {ros_domain()}, too: "
-            "end one of the two",
-            file=sys.stderr,
-        )
+        raise _already_published(_listed(others))
+
+
+def _already_published(by: str) -> RobotAlreadyRunningError:
+    return RobotAlreadyRunningError(
+        f"{TOPIC}: already published on ROS domain {ros_domain()} by {by}. Stop it, or set "
+        "ROS_DOMAIN_ID to another number"
+    )
 
 
 def _listed(robots: Mapping[int, str]) -> str:

@@ -29,6 +29,8 @@ _MAX_OFFSET_S = 0.004
 _OFFSET_STEPS_S = (0.0005, 0.00005)
 """Largest offset of the clocks, and steps of the coarse and the fine grid, s."""
 _JACKKNIFE_GROUPS = 10
+_MIN_CLUSTERS = 10
+"""Clusters on which a drift is tested, at least."""
 _MAX_DRIFT_S = 0.010
 """Largest drift between the two clocks over a recording, s: 100 ppm, as of two crystals, in 100 s."""
 _DRIFT_STEPS_S = (0.0005, 0.0001)
@@ -365,6 +367,8 @@ class _DelayLines:
     def drift_is_significant(self) -> bool:
         """Return whether a line beats a constant delay on clusters that neither was fitted to."""
         tested = np.arange(len(self.time)) % 2 == 1
+        if tested.sum() < _MIN_CLUSTERS:
+            return False
         line, constant = self._best_line(~tested), self._best_line(~tested, with_drift=False)
         if not line[0]:
             return False

@@ -42,6 +42,8 @@ UNRELATED_CORRELATION = 0.3
 """If the correlation of dq with the slope of q is below, dq is not the speed of that joint."""
 ZERO_SPEED_SHARE = 2e-4
 """Size of dq over that of the slope of q, below which dq is noise about 0."""
+SAME_ANGLE_SHARE = 0.7
+"""q and q_des are one angle in two units if they differ by less than this share of their size."""
 MAX_ANGLE_RAD = 10.0
 """rad; no joint of a leg or an arm reaches so far."""
 UNITS_OF_SPEED = (
@@ -249,6 +251,12 @@ def speed_units(log: Log) -> Iterator[Finding]:
             return
 
 
+def _is_same_angle(degrees: Floats, radians: Floats, valid: Bools) -> bool:
+    """Whether the first angles, taken as degrees, are the second ones but for what a drive leaves."""
+    off = np.sqrt(np.mean((DEGREE_RAD * degrees - radians) ** 2, where=valid))
+    return bool(off < SAME_ANGLE_SHARE * np.sqrt(np.mean(radians**2, where=valid)))
+
+
 def angle_units(log: Log) -> Iterator[Finding]:
     """Angles in valid rows that are too large for a joint, in q, in the commands or in both.
 
@@ -264,10 +272,9 @@ def angle_units(log: Log) -> Iterator[Finding]:
         return
     q = np.asarray(log.q[row], dtype=float)
     q_des = np.asarray(log.q_des[log.command_rows(log.t[row])], dtype=float)
-    size, asked = (float(np.sqrt(np.mean(x**2, where=valid))) for x in (q, q_des))
-    for field, other, large, small in (("q_des", "q", asked, size), ("q", "q_des", size, asked)):
-        share = large / small if small > 0.0 else np.inf
-        if 25.0 < share < 130.0:
+    for field, other, large, small in (("q_des", "q", q_des, q), ("q", "q_des", q, q_des)):
+        share = float(np.sqrt(np.mean(large**2, where=valid) / (np.mean(small**2, where=valid) + 1e-300)))
+        if 25.0 < share < 130.0 and _is_same_angle(large, small, valid):
             text = f"{field}: about {share:.0f} times as large as {other}: degrees? expected rad in both"
             yield Finding("refusal", field, (), text)
             return

@@ -116,8 +116,9 @@ ROW_CHECKS = (
     ),
     Check(
         angles.angle_units,
-        "size of q_des over that of q; size of q, rad",
-        f"25 to 130; {angles.MAX_ANGLE_RAD:g}",
+        "size of q_des over that of q; difference of the two, one taken as degrees, over their size; "
+        "size of q, rad",
+        f"25 to 130; {angles.SAME_ANGLE_SHARE:g}; {angles.MAX_ANGLE_RAD:g}",
         "refusal",
     ),
     Check(
