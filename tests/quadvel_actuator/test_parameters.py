@@ -105,3 +105,13 @@ def test_a_file_without_a_name_is_that_of_the_aliengo(tmp_path):
     assert ActuatorParameters.load(ALIENGO, _written(tmp_path, robot=None)).robot == "aliengo"
     with pytest.raises(ValueError, match=r"changed\.yaml: .*robot: found 'aliengo', expected 'go2'"):
         ActuatorParameters.load(GO2, _written(tmp_path, robot=None))
+
+
+def test_a_file_of_some_joints_is_refused_where_all_are_needed(tmp_path):
+    few = attrs.evolve(ActuatorParameters.of(ALIENGO), joints=["FR_hip_joint", "FR_thigh_joint"], effects=())
+    few.save(tmp_path / "few.yaml")
+    assert ActuatorParameters.load(ALIENGO, tmp_path / "few.yaml", some_joints=True) == few
+    with pytest.raises(
+        ValueError, match=r"few.yaml: joints: found 2 \(FR_hip_joint, FR_thigh_joint\), expected all 12"
+    ):
+        ActuatorParameters.load(ALIENGO, tmp_path / "few.yaml")

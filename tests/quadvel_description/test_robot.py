@@ -85,7 +85,16 @@ def test_tables_cannot_be_changed_by_accident():
         ALIENGO.nominal_q[0] = 1.0
 
 
-@pytest.mark.parametrize("change", [{"kp": 0.0}, {"torque_limit": [1.0, 2.0]}, {"lie_q": [0.0, 9.0, -1.0]}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"kp": 0.0},
+        {"torque_limit": [1.0, 2.0]},
+        {"velocity_limit": 0.0},
+        {"armature": [0.0, 0.0, -0.01]},
+        {"lie_q": [0.0, 9.0, -1.0]},
+    ],
+)
 def test_a_wrong_number_of_a_robot_is_refused_by_its_name(tmp_path, change):
     folder = tmp_path / "mine"
     shutil.copytree(ALIENGO.folder, folder)

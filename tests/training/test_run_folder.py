@@ -69,5 +69,5 @@ def test_actuators_of_some_joints_are_refused_before_training(tmp_path, drives):
     arguments = ["tune", "--actuator", str(drives), "--policy", str(start), "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
-    assert "found 3 names" in result.output
+    assert "joints: found 3" in result.output
     assert not (tmp_path / "out").exists()

@@ -16,6 +16,7 @@ import yaml
 
 from quadvel_description.bounded_yaml import read_yaml
 from quadvel_description.fields import Numbers, field, positive, refusal
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.records import structure_record
 from quadvel_description.robot import Robot
 from quadvel_description.robot_name import UNNAMED_ROBOT
@@ -140,12 +141,13 @@ class ActuatorParameters:
         )
 
     @classmethod
-    def load(cls, robot: Robot, path: str | Path) -> ActuatorParameters:
+    def load(cls, robot: Robot, path: str | Path, some_joints: bool = False) -> ActuatorParameters:
         """Read a parameter file.
 
         Args:
             robot: The robot that the file has to belong to.
             path: YAML file.
+            some_joints: Whether it may hold some joints only.
 
         Returns:
             The parameters.
@@ -158,6 +160,11 @@ class ActuatorParameters:
         parameters = structure_record(cls, content, Path(path))
         if parameters.robot != robot.name:
             raise ValueError(f"{path}: {refusal(cls, 'robot', parameters.robot, repr(robot.name))}")
+        if not some_joints and len(names := parameters.joints or JOINT_NAMES) != len(JOINT_NAMES):
+            raise ValueError(
+                f"{path}: joints: found {len(names)} ({', '.join(names)}), expected all {len(JOINT_NAMES)} of the "
+                "robot: identify it without --joints"
+            )
         return parameters
 
     def save(self, path: str | Path) -> None:

@@ -114,24 +114,23 @@ def _per_joint(value: Any) -> Any:
     return to_array(len(JOINT_NAMES), value)
 
 
-def _joints(description: str, default: Any = attrs.NOTHING) -> Any:
+def _joints(
+    description: str, default: Any = attrs.NOTHING, *, at_least: float = -np.inf, above: float = -np.inf
+) -> Any:
     """Declare a field with a number for each joint."""
+    limit = "" if at_least == -np.inf else f", at least {at_least:g}"
+    limit = limit if above == -np.inf else f", above {above:g}"
+
+    def check(robot: object, attribute: attrs.Attribute[Any], value: Any) -> None:
+        """Refuse anything but twelve finite numbers within the limits."""
+        is_vector = isinstance(value, np.ndarray) and value.shape == (len(JOINT_NAMES),)
+        if not is_vector or not (np.isfinite(value) & (value >= at_least) & (value > above)).all():
+            expected = f"1, 3 (hip, thigh, calf) or 12 finite numbers{limit}"
+            raise refusal(robot, attribute.name, value, expected)
+
     return attrs.field(
-        default=default,
-        converter=_per_joint,
-        validator=_check_joints,
-        metadata={"description": description},
+        default=default, converter=_per_joint, validator=check, metadata={"description": description}
     )
-
-
-def _check_joints(robot: object, attribute: attrs.Attribute[Any], value: Any) -> None:
-    """Refuse anything but twelve finite numbers."""
-    if (
-        not isinstance(value, np.ndarray)
-        or value.shape != (len(JOINT_NAMES),)
-        or not np.isfinite(value).all()
-    ):
-        raise refusal(robot, attribute.name, value, "1, 3 (hip, thigh, calf) or 12 finite numbers")
 
 
 @attrs.frozen(eq=False, kw_only=True)
@@ -236,11 +235,11 @@ class Robot:
     nominal_q: Array = _joints("stance, rad")
     lie_q: Array = _joints("lying, rad")
     suspended_height: float = positive()
-    torque_limit: Array = _joints("N m")
-    velocity_limit: Array = _joints("rad/s")
-    armature: Array = _joints("kg m^2")
-    joint_friction: Array = _joints("N m")
-    joint_damping: Array = _joints("N m s/rad")
+    torque_limit: Array = _joints("N m", above=0.0)
+    velocity_limit: Array = _joints("rad/s", above=0.0)
+    armature: Array = _joints("kg m^2", at_least=0.0)
+    joint_friction: Array = _joints("N m", at_least=0.0)
+    joint_damping: Array = _joints("N m s/rad", at_least=0.0)
     foot_radius: float = positive()
     drive: Drive = Drive()
     links: tuple[Link, ...]

@@ -187,7 +187,7 @@ def identify(
         read = partial(read_log, joints=joints, names=names, topics=topics, robot=kind)
         parameters = None
         if base is not None:
-            parameters = ActuatorParameters.load(load_robot(kind or DEFAULT_ROBOT), base)
+            parameters = ActuatorParameters.load(load_robot(kind or DEFAULT_ROBOT), base, some_joints=True)
         options = IdentifyOptions(gains=gains, base=parameters, robot=robot)
         found = _identify(logs, holdout or [], read, options, cores, messages)
         _write(found, out, force, messages)
