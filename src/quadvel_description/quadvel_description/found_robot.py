@@ -124,8 +124,11 @@ def find_robot(path: Path) -> FoundRobot:
 
     Raises:
         FileNotFoundError: There is no such file.
+        IsADirectoryError: It is a folder.
         UnsupportedRobotError: The file cannot be read, or its robot is no quadruped with twelve joints.
     """
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: found a folder, expected an MJCF or URDF file")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: found no such file, expected an MJCF or URDF")
     return _Finder(path, _compile(path)).find()

@@ -107,7 +107,7 @@ def _require_ended_path(now: Situation) -> str:
 
 def _require_nominal_posture(now: Situation) -> str:
     """The joints are near the nominal posture."""
-    return now.posture_error
+    return f"{now.posture_error}, request stand_up" if now.posture_error else ""
 
 
 def _require_other_posture(now: Situation) -> str:
