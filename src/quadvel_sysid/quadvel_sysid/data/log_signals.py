@@ -40,6 +40,7 @@ class LogSignals:
         commands: Command signals by name, (M, J).
         gains: kp and kd, (M, J); 1 if they are not known.
         sums: Integral (M + 1, J) of each command signal that is not 0.
+        smoothed_rows: Number of rows over which q and dq are averaged; 1 without smoothing.
         signals: All of these signals by name.
     """
 
@@ -56,10 +57,9 @@ class LogSignals:
         self.log, self.origin = log, float(log.t[0]) if log.recording_start is None else log.recording_start
         self.t, self.t_cmd = as_double(log.t), as_double(log.t_cmd)
         self.states = {"q": as_double(log.q), "dq": as_double(log.dq)}
-        if smoothing > 0.0:
-            self.states = {
-                k: local_lines(as_double(log.t), values, smoothing)[0] for k, values in self.states.items()
-            }
+        self._smoothing = smoothing
+        self.smoothed_rows = 2 * round(smoothing / log.period) + 1
+        self.states = {name: self._smoothed(values) for name, values in self.states.items()}
         if log.temperature is not None:
             self.states["temperature"] = as_double(log.temperature)
         if log.voltage is not None:
@@ -87,6 +87,10 @@ class LogSignals:
         self._slopes: dict[float, Array] = {}
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
 
+    def _smoothed(self, values: Array) -> Array:
+        """Fit lines to the values (N, J) of the rows around each row; return their values there."""
+        return local_lines(self.t, values, self._smoothing)[0] if self._smoothing > 0.0 else values
+
     def with_encoder_errors(self, q: Array, dq: Array) -> LogSignals:
         """Add errors to the measured states.
 
@@ -95,11 +99,12 @@ class LogSignals:
             dq: (N, J) error of dq, rad/s.
 
         Returns:
-            The signals as a log with these errors would have them, without smoothing of the errors.
+            The signals as a log with these errors would have them.
         """
         other = copy(self)
         other.log = attrs.evolve(self.log, q=self.log.q + q, dq=self.log.dq + dq)
-        other.states = {**self.states, "q": self.states["q"] + q, "dq": self.states["dq"] + dq}
+        errors = {"q": self._smoothed(q), "dq": self._smoothed(dq)}  # lines are linear in the values
+        other.states = self.states | {name: self.states[name] + error for name, error in errors.items()}
         other.signals = {**self.signals, **other.states}
         other._slopes, other._smooth = {}, {}
         return other

@@ -216,14 +216,25 @@ class Sources:
 
     @cached_property
     def encoder_noise(self) -> tuple[Array, Array]:
-        """Variance of the white noise of q (J,), rad^2, and of dq (J,), rad^2/s^2."""
+        """Variance of the white noise of q (J,), rad^2, and of dq (J,), rad^2/s^2, as logged."""
         every = np.ones((self.first_row[len(self.series)], self.sent.shape[1]), dtype=bool)
         start = np.concatenate([_stretches(one.log)[0] for one in self.series])
         q, dq = (
-            difference_variance(np.concatenate([one.states[name] for one in self.series]), every, start)
+            difference_variance(
+                np.concatenate([as_double(getattr(one.log, name)) for one in self.series]), every, start
+            )
             for name in ("q", "dq")
         )
         return q, dq
+
+    @property
+    def interpolated_noise(self) -> tuple[Array, Array]:
+        """Part of the variances of q (J,) and dq (J,) that interpolation between two rows can average."""
+        # An average over n rows leaves noise of the variance 1 / n, of which the next row has the share
+        # (n - 1) / n, too: 1 / n - (n - 1) / n^2 = 1 / n^2.
+        share = 1.0 / self.series[0].smoothed_rows ** 2
+        q, dq = self.encoder_noise
+        return share * q, share * dq
 
     def with_more_noise(self) -> Sources:
         """Add white noise to q and dq, with the variance of the noise that they have.

@@ -124,7 +124,7 @@ class Model:
             Variance that a fair comparison of delays adds to the squared residual, (N, J), N^2 m^2.
         """
         # tau holds g_p kp e_q + g_d kd e_dq, with the noise e of q and dq at the instant u.
-        s, (q_noise, dq_noise) = self.signals, self.samples.sources.encoder_noise
+        s, (q_noise, dq_noise) = self.signals, self.samples.sources.interpolated_noise
         kp, kd = self._charged_gains
         noise: Array = (kp * s.kp) ** 2 * q_noise + (kd * s.kd) ** 2 * dq_noise
         return noise * s.averaging
