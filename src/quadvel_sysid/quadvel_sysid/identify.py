@@ -9,6 +9,7 @@ The steps, each of which takes what the one before returns:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from operator import itemgetter
 from typing import Any
 
 import attrs
@@ -16,11 +17,12 @@ import numpy as np
 
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .data.clocks import known_offsets
+from .data.clocks import RecordingClock, align_heldout, known_offsets
 from .data.dataset import Dataset, Progress, no_progress
 from .data.noise import noise_variance
 from .data.plain_model import DRIVE_WINDOWS_S
 from .data.preparation import Preprocessed, preprocess
+from .data.signals import Samples
 from .data.split import MIN_BLOCK_S, DataSplit
 from .export.replay import Load, Replay, find_load
 from .logs.check_log import check_logs
@@ -139,22 +141,23 @@ def _identify_once(dataset: Dataset, options: IdentifyOptions, progress: Progres
     refitted = {one: _refit_all_rows(one, prepared) for one in dict.fromkeys(models)}
     chosen = replay.choose(refitted) if replay else best
 
-    # 4. Intervals and report.
+    # 4. Clocks of held-out recordings as each model sees them, intervals and report.
     progress(0.93, "intervals")
-    after = refitted[chosen]
+    aligned = {one: _aligned(refitted[one], dataset, prepared) for one in {before, chosen, best_effects}}
+    after, clocks = aligned[chosen]
     outcome = Outcome(
-        before=refitted[before],
+        before=aligned[before][0],
         after=after,
-        effects_alone=refitted[best_effects],
+        effects_alone=aligned[best_effects][0],
         evidence=_evidence(search, searched.record, chosen, after, parts),
-        half_widths=intervals(after, parts, evaluator.noise, known_offsets(prepared.clocks)),
+        half_widths=intervals(after, parts, evaluator.noise, known_offsets(clocks)),
         noise=evaluator.noise,
         parts=parts,
         base=base,
-        clocks=prepared.clocks,
+        clocks=clocks,
     )
     found = build_identification(outcome, [*dataset.findings, *notes])
-    report = {**found.report, **_comparisons(outcome, replay)}
+    report = {**found.report, **_comparisons(outcome, prepared.samples, replay)}
     if "motion" in report:
         report |= motion_summary(report)
     report |= withheld_summary(report, list(implausibilities(after, parts)), list(contradictions(report)))
@@ -206,6 +209,23 @@ def _refit_all_rows(fitted: FittedModel, prepared: Preprocessed) -> Model:
     return quantised_delays(central_equivalent_delay(model, rows), rows)
 
 
+def _aligned(
+    model: Model, dataset: Dataset, prepared: Preprocessed
+) -> tuple[Model, tuple[RecordingClock, ...]]:
+    """The model on held-out recordings whose commands are shifted as it predicts them best, and all clocks."""
+    samples, clocks = model.samples, []
+    for clock, pieces in zip(prepared.clocks, dataset.pieces, strict=True):
+        if clock.heldout and clock.offset_s is not None:
+            mine = np.isin(samples.log_of_row, pieces)[:, None]
+            rows = samples.evaluated & mine & ~prepared.parts.report
+            samples, shift = align_heldout(
+                lambda moved: attrs.evolve(model, samples=moved).predict(), samples, pieces, rows
+            )
+            clock = clock.shifted_further(shift)
+        clocks.append(clock)
+    return attrs.evolve(model, samples=samples), tuple(clocks)
+
+
 def _evidence(
     search: Search, record: SearchRecord, fitted: FittedModel, model: Model, parts: DataSplit
 ) -> Evidence:
@@ -224,10 +244,13 @@ def _evidence(
     )
 
 
-def _comparisons(outcome: Outcome, replay: Replay | None) -> dict[str, Any]:
+def _comparisons(outcome: Outcome, samples: Samples, replay: Replay | None) -> dict[str, Any]:
     """Sections of the report: errors of the baselines, and of replays where there is a load."""
     parts = outcome.parts
-    baselines = baseline_errors(outcome.samples, parts.fit_or_select, parts.report)
+    # Held-out recordings are aligned by three models; each baseline is judged where it is best.
+    alignments = dict.fromkeys((samples, outcome.before.samples, outcome.samples))
+    each = [baseline_errors(one, parts.fit_or_select, parts.report) for one in alignments]
+    baselines = {name: min((one[name] for one in each), key=itemgetter("heldout_mse")) for name in each[0]}
     replays = replay.section(outcome.before, outcome.after) if replay else {}
     return {"baselines": baselines, **replays}
 

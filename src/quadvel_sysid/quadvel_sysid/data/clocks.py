@@ -25,9 +25,24 @@ from .split import cluster_starts, reported_rows
 
 _SIGNIFICANCE_LEVEL = 0.01
 """Significance level of the tests that change the stamps of a recording."""
-_MAX_OFFSET_S = 0.004
-_OFFSET_STEPS_S = (0.0005, 0.00005)
-"""Largest offset of the clocks, and steps of the coarse and the fine grid, s."""
+
+
+@attrs.frozen
+class _ShiftGrid:
+    """Grids of shifts of the commands, s: a coarse one about 0, and a fine one about its best shift."""
+
+    coarse_reach: float
+    coarse_step: float
+    fine_reach: float
+    fine_step: float
+
+
+_OFFSETS = _ShiftGrid(0.004, 0.0005, 0.001, 0.00005)
+"""Offsets of the clocks as the plain model sees them."""
+_REALIGNMENT = _ShiftGrid(0.002, 0.0005, 0.0005, 0.0001)
+"""Further shifts of a held-out recording; each takes a prediction of the whole corrected model."""
+_EQUAL_ERRORS = 1e-6
+"""Relative difference of errors that round-off explains."""
 _JACKKNIFE_GROUPS = 10
 _MIN_CLUSTERS = 10
 """Clusters on which a drift is tested, at least."""
@@ -60,6 +75,20 @@ class RecordingClock:
     half_width_s: float = 0.0
     drift: float = 0.0
     drift_half_width: float = 0.0
+
+    def shifted_further(self, shift: float) -> RecordingClock:
+        """Return the clock after a further shift of the commands.
+
+        Args:
+            shift: The shift, s.
+
+        Returns:
+            The clock with the whole offset; the same clock without a shift.
+        """
+        if not shift:
+            return self
+        offset = self.offset_s or 0.0
+        return attrs.evolve(self, offset_s=shift + (offset if abs(offset) > self.half_width_s else 0.0))
 
 
 def known_offsets(clocks: Sequence[RecordingClock]) -> tuple[float, ...]:
@@ -166,6 +195,37 @@ def align_commands(
         for k in pieces if abs(shift) > half else ():
             logs[k] = attrs.evolve(logs[k], t_cmd=logs[k].t_cmd + shift)
     return dataset.with_logs(logs), aligned
+
+
+def align_heldout(
+    predict: Callable[[Samples], Array], samples: Samples, logs: Sequence[int], rows: Bools
+) -> tuple[Samples, float]:
+    """Shift the commands of a held-out recording so that a fitted model predicts it best.
+
+    `align_commands` finds the offset of its clocks with the plain model. What that lacks, such as a lag
+    or an inertia, acts like a delay, which is another one in each recording. A shift within its 95 %
+    interval of 0 is not applied.
+
+    Args:
+        predict: Torque (N, J), N m, that the model predicts for samples.
+        samples: Rows of all logs.
+        logs: Numbers of the recording's logs.
+        rows: Rows (N, J) that may be used: none that is fitted or reported.
+
+    Returns:
+        The samples with the shift, and the shift, s.
+    """
+    starts = cluster_starts(samples)
+
+    def errors(shifts: Array) -> Array:
+        """Squared error of each cluster at each shift (S,), s, (S, C)."""
+        moved = (samples.with_shifted_commands(logs, float(shift)) for shift in shifts)
+        return np.stack([_cluster_errors(one.tau - predict(one), rows, starts) for one in moved])
+
+    shift, half = _best_shift(errors, _REALIGNMENT)
+    if abs(shift) <= half:
+        return samples, 0.0
+    return samples.with_shifted_commands(logs, shift), shift
 
 
 def clock_findings(dataset: Dataset, clocks: Sequence[RecordingClock]) -> list[tuple[str, Finding]]:
@@ -275,10 +335,8 @@ class _DelayProfile:
     def errors(self, delays: Array) -> Array:
         """Return the squared error of each cluster at each delay (D,), s, (D, C)."""
         moved = (attrs.evolve(self.eam, input_delay=self.eam.input_delay + delay) for delay in delays)
-        squares = ((self.samples.tau - one.predict(self.samples)) ** 2 for one in moved)
-        return np.stack(
-            [np.add.reduceat(np.sum(one, axis=1, where=self.rows), self.starts) for one in squares]
-        )
+        residuals = (self.samples.tau - one.predict(self.samples) for one in moved)
+        return np.stack([_cluster_errors(one, self.rows, self.starts) for one in residuals])
 
     @property
     def time(self) -> Array:
@@ -290,16 +348,40 @@ def _offset(dataset: Dataset, recording: int, eam: Eam, length: float) -> tuple[
     """Delay (s) of the commands beyond the model's input delay, and its 95 % half width."""
     logs = [dataset.logs[k] for k in dataset.pieces[recording]]
     profile = _DelayProfile.of(eam, logs, dataset, recording, (), length)
-    coarse, fine = _OFFSET_STEPS_S
-    delays = np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + coarse / 2, coarse)
-    about = delays[int(np.argmin(profile.errors(delays).sum(axis=1)))]
-    delays = about + np.arange(-2.0 * coarse, 2.0 * coarse + fine / 2, fine)
-    each = profile.errors(delays)
+    offset, half = _best_shift(profile.errors, _OFFSETS)
+    return offset, min(half, _OFFSETS.coarse_reach)
+
+
+def _best_shift(errors: Callable[[Array], Array], grid: _ShiftGrid) -> tuple[float, float]:
+    """Find the shift with the least error on two grids.
+
+    Args:
+        errors: Returns the squared error of each cluster for shifts (S,), s, (S, C).
+        grid: The grids.
+
+    Returns:
+        The shift, s, and the half width of its 95 % interval, s.
+    """
+    shifts = np.arange(-grid.coarse_reach, grid.coarse_reach + grid.coarse_step / 2, grid.coarse_step)
+    about = _least_shift(shifts, errors(shifts).sum(axis=1))
+    shifts = about + np.arange(-grid.fine_reach, grid.fine_reach + grid.fine_step / 2, grid.fine_step)
+    each = errors(shifts)
 
     def best(used: Bools | slice) -> float:
-        return float(delays[int(np.argmin(each[:, used].sum(axis=1)))])
+        return _least_shift(shifts, each[:, used].sum(axis=1))
 
-    return best(slice(None)), min(_jackknife_half_width(best, each.shape[1]) + fine, _MAX_OFFSET_S)
+    return best(slice(None)), _jackknife_half_width(best, each.shape[1]) + grid.fine_step
+
+
+def _least_shift(shifts: Array, errors: Array) -> float:
+    """Return the shift (S,) with the least error (S,); of equal ones, as between two rows, the smallest."""
+    equal = errors <= (1.0 + _EQUAL_ERRORS) * errors.min()
+    return float(min(shifts[equal], key=abs))
+
+
+def _cluster_errors(residual: Array, rows: Bools, starts: Indices) -> Array:
+    """Squared error of each cluster, (C,), of a residual (N, J) on some rows."""
+    return np.asarray(np.add.reduceat(np.sum(residual**2, axis=1, where=rows), starts))
 
 
 def _jackknife_half_width(estimate: Callable[[Bools], float], clusters: int) -> float:

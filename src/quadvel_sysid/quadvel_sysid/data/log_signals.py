@@ -109,6 +109,21 @@ class LogSignals:
         other._slopes, other._smooth = {}, {}
         return other
 
+    def with_shifted_commands(self, shift: float) -> LogSignals:
+        """Shift the times of the commands.
+
+        Args:
+            shift: Time to add to them, s.
+
+        Returns:
+            The signals of the log with later (positive) or earlier commands.
+        """
+        other = copy(self)
+        other.log = attrs.evolve(self.log, t_cmd=self.log.t_cmd + shift)
+        other.t_cmd = as_double(other.log.t_cmd)
+        other._smooth = {}
+        return other
+
     def locate(self, at: Array) -> tuple[Indices, Array]:
         """Find the interval of state rows that holds each time.
 

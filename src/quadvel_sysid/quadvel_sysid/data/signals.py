@@ -362,6 +362,22 @@ class Samples:
         )
         return max(kp, 1e-6), max(kd, 1e-6)
 
+    def with_shifted_commands(self, logs: Sequence[int], shift: float) -> Samples:
+        """Shift the command stamps of some logs.
+
+        Args:
+            logs: Numbers of the logs.
+            shift: Time to add to their stamps, s.
+
+        Returns:
+            The same rows with shifted commands.
+        """
+        series = [
+            one.with_shifted_commands(shift) if k in logs else one
+            for k, one in enumerate(self.sources.series)
+        ]
+        return attrs.evolve(self, sources=Sources.of(series))
+
     def drop_heldout(self, rows: Bools) -> Samples:
         """Drop the logs at the end that hold none of the given rows.
 
