@@ -8,8 +8,16 @@ import attrs
 import numpy as np
 import pytest
 
-from quadvel_sysid.data.clocks import align_commands, choose_stamps, clock_findings, remove_drift
+from quadvel_sysid.data.clocks import (
+    align_commands,
+    align_heldout,
+    choose_stamps,
+    clock_findings,
+    remove_drift,
+)
 from quadvel_sysid.data.dataset import Dataset
+from quadvel_sysid.data.plain_model import fit_eam
+from quadvel_sysid.data.signals import Samples
 from quadvel_sysid.data.split import block_length, reported_rows
 from quadvel_sysid.logs.check_log import CheckedLog
 from quadvel_sysid.logs.log import Log
@@ -75,6 +83,19 @@ def test_clocks_that_do_not_drift_are_left_alone(seed: int) -> None:
     same, found = remove_drift(logs, clocks, WINDOWS, block_length(logs))
     assert found == clocks
     assert same.logs[0] is logs.logs[0]
+
+
+@pytest.mark.parametrize("late", [0.0, 0.0012, -0.0012])
+def test_a_held_out_recording_is_aligned_as_the_judged_model_sees_it(late: float) -> None:
+    logs = dataset(recording(1, 1e-7), heldout=[recording(2, 1e-7)])
+    samples = Samples.of(logs.logs)
+    held = (samples.log_of_row == 1)[:, None]
+    eam = fit_eam(samples, samples.evaluated & ~held, windows=WINDOWS)
+    moved = samples.with_shifted_commands([1], late)
+    aligned, shift = align_heldout(eam.predict, moved, [1], samples.evaluated & held)
+    assert shift == pytest.approx(-late, abs=2e-4)
+    errors = [np.mean((one.tau - eam.predict(one)) ** 2, where=held) for one in (samples, aligned)]
+    assert errors[1] < 1.1 * errors[0]
 
 
 def test_one_log_says_that_its_clocks_cannot_be_told_from_the_delay() -> None:

@@ -64,3 +64,17 @@ def test_slower_log_is_evaluated_as_well():
     samples = Samples.of([fast, slow.select_rows(every)])
     assert samples.evaluated[samples.log_of_row == 1].mean() > 0.9
     assert samples.start[samples.log_of_row == 1].sum() == 1
+
+
+@pytest.mark.parametrize("rows", [0, 1, 2])
+def test_the_noise_of_encoders_is_that_of_the_log_also_where_they_are_averaged(rows):
+    """rows: on either side of the average of q and dq."""
+    log, rng = _log(seconds=20.0), np.random.default_rng(4)
+    noise = 0.3 * rng.standard_normal(log.dq.shape)
+    sources = Samples.of([attrs.evolve(log, dq=log.dq + noise)], rows * log.period).sources
+    assert sources.encoder_noise[1] == pytest.approx(0.3**2, rel=0.1)
+    count = 2 * rows + 1
+    averaged = np.lib.stride_tricks.sliding_window_view(noise, count, axis=0).mean(axis=-1)
+    halfway = 0.5 * (averaged[1:] + averaged[:-1])
+    removed = averaged.var(axis=0) - halfway.var(axis=0)
+    assert 0.5 * sources.interpolated_noise[1] == pytest.approx(removed, rel=0.25)
