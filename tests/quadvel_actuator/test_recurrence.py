@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 CALL = """
 import numpy as np
 from quadvel_actuator.effects import recurrence
@@ -18,6 +20,7 @@ print(recurrence.rate_limit_series(rows, 0.0 * one, 0.001 * one, start, 1000.0)[
 SEVERAL = 2
 
 
+@pytest.mark.long
 def test_loops_compiled_by_concurrent_processes_serve_later_ones(tmp_path: Path) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "OMP_NUM_THREADS": "1"}
     for together in (SEVERAL, 1):

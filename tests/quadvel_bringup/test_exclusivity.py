@@ -29,6 +29,7 @@ def robot_name(line: list[str]) -> str | None:
     [
         ("quadvel", ["run", "board", "--ros-args"], "board"),
         ("lib/quadvel_driver/driver", ["--ros-args"], "driver"),
+        ("quadvel", ["run", "driver", "--ros-args", "-p", "dry_run:=true"], None),
         ("quadvel", ["up", "--low-level", "board"], None),
         ("quadvel", ["run", "controller", "board"], None),
         ("backup", ["board", "driver"], None),

@@ -24,7 +24,7 @@ LONG = {
     "following": [],
     "bench": [],
 }
-USUAL = ("excite", "eval")
+USUAL = ("excite",)
 """Those that are run always; the others, which end in the same way, by hand"""
 
 

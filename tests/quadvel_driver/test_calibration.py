@@ -144,6 +144,7 @@ def test_a_leaning_imu_is_not_taken_for_joints_that_are_off() -> None:
     np.testing.assert_allclose(found.calibration.imu_mounting, LEANING.imu_mounting, atol=0.2 * DEGREE)
 
 
+@pytest.mark.long
 def test_a_leaning_imu_of_a_suspended_robot_is_found_for_encoders_that_are_right() -> None:
     found = fitted(LEANING, has_stood=False)
     assert not found.calibration.joint_zeros.any()

@@ -110,6 +110,7 @@ def test_a_hung_robot_is_moved_and_recorded_at_1_khz_without_gaps(tmp_path: Path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["steps.mcap"]
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_it_and_leaves_no_file(tmp_path: Path) -> None:
     running = subprocess.Popen(excite("sweep", "--seconds", 600, "--out", tmp_path / "x.mcap"))
     until = time.monotonic() + 120.0

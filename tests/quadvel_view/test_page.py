@@ -380,7 +380,8 @@ def test_a_recording_plays_and_nothing_comes_from_elsewhere(
     assert page.complaints == []
 
 
-@pytest.mark.parametrize("name", ["127.0.0.1", pytest.param("localhost", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
 def test_with_a_token_the_scene_is_drawn_under_each_name_of_this_host(
     browser: Any, walked: Path, tmp_path: Path, name: str
 ) -> None:

@@ -18,6 +18,8 @@ ROBOT_PROGRAMS = ("sim_node", "board", "driver", "quadvel_lab.plant")
 """Nodes and modules of drivers and simulated robots."""
 PUBLISHERS = {"sim_node", "driver"}
 """Those nodes of them that publish low_state."""
+DRY_RUN = "dry_run:=true"
+"""Argument of a driver that publishes nothing, and so is no robot."""
 LOADED_DISCOVERY_TIME_S = 4.0
 """Time to discover other publishers if one of ROBOT_PROGRAMS runs on this machine, which may be busy and answer late."""
 
@@ -108,7 +110,7 @@ def _robot_program(words: list[str]) -> str | None:
             program = name
         case _:
             program = words[0] if words else ""
-    return program if program in ROBOT_PROGRAMS else None
+    return program if program in ROBOT_PROGRAMS and DRY_RUN not in words else None
 
 
 def _program(folder: Path) -> list[str]:
