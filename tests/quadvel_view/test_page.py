@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from io import BytesIO
 from itertools import combinations
 from pathlib import Path
@@ -80,16 +80,33 @@ class Served:
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """It draws in software: where it gets in the way of robots of other tests, it waits."""
-    gently = tmp_path_factory.mktemp("browser") / "chromium"
-    lowest = "echo 19 2>/dev/null >/proc/self/autogroup"  # nice counts within a session only
-    gently.write_text(f'#!/bin/sh\n{lowest}\nexec nice -n 19 {CHROMIUM} "$@"\n')
-    gently.chmod(0o755)
+def launch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Any]]:
+    """Starts a browser after a line of shell; it draws in software, so its priority is low."""
     with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=gently, args=[*ARGUMENTS])
-        yield browser
-        browser.close()
+
+        def begin(first: str) -> Any:
+            program = tmp_path_factory.mktemp("browser") / "chromium"
+            program.write_text(f'#!/bin/sh\n{first}\nexec nice -n 19 {CHROMIUM} "$@"\n')
+            program.chmod(0o755)
+            return started.chromium.launch(executable_path=program, args=[*ARGUMENTS])
+
+        yield begin
+
+
+@pytest.fixture(scope="module")
+def browser(launch: Callable[[str], Any]) -> Iterator[Any]:
+    """A browser that gets its share of the processor beside other tests."""
+    browser = launch("")
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def waiting_browser(launch: Callable[[str], Any]) -> Iterator[Any]:
+    """A browser that waits for the robot: niceness counts within a session alone, that of autogroups between them."""
+    browser = launch("echo 19 2>/dev/null >/proc/self/autogroup")
+    yield browser
+    browser.close()
 
 
 @pytest.fixture(scope="module")
@@ -233,12 +250,12 @@ def test_pad_walks_the_robot_and_stop_stops_it(page: Page) -> None:
 
 @pytest.mark.realtime
 def test_the_page_opens_soon_shows_thirty_pictures_a_second_and_costs_one_deadline_in_a_hundred_at_most(
-    browser: Any, robot: str
+    waiting_browser: Any, robot: str
 ) -> None:
     seconds = 20
 
     def opened() -> Page:
-        page = Page(browser, robot)
+        page = Page(waiting_browser, robot)
         page.until("state.loop.missed !== undefined")
         return page
 
