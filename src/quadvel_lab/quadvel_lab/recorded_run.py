@@ -77,7 +77,7 @@ class RecordedRun(ABC):
         columns = (TextColumn("{task.description:24}"), BarColumn(), TimeElapsedColumn())
         self._bar = Progress(*columns, console=console)
         self._output = PrefixedOutput(list(nodes), console)
-        self._waiting_planner: Sequence[str] = ()
+        self._waiting_planner = nodes.get(PLANNER, ())
         self._task = self._bar.add_task("start", total=total)
 
     @abstractmethod
@@ -140,7 +140,6 @@ class RecordedRun(ABC):
             ):
                 for topic, kind in {**RECORDED_TOPICS, **self._topics}.items():
                     recorder.record(topic, kind)
-                self._waiting_planner = self._nodes.get(PLANNER, ())
                 with ProcessGroup(self._output) as group:
                     for name, line in self._nodes.items():
                         if name != PLANNER:
