@@ -5,7 +5,6 @@ Every node runs in its own process; this process records all topics.
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -41,12 +40,6 @@ RECORDED_TOPICS = {
 """Topics and types that every run records; each run adds those of its planner."""
 LOCKSTEP_HINT = "if this machine is slow or busy, use --lockstep: simulated time then waits for the nodes"
 """What to try if a run in real time failed."""
-PLANNER = "planner"
-"""Name of the node that makes the robot walk."""
-MEASURED = "/ground_truth/odom"
-"""Topic without which no run can be judged; it is published once its publisher knows the recorder."""
-MAX_WAIT_S = 20.0
-"""Time for it to be heard; the planner then starts all the same."""
 POLL_PERIOD_S = 0.2
 """Time between two checks of the nodes."""
 
@@ -56,8 +49,7 @@ class RecordedRun(ABC):
 
     Args:
         recording: The MCAP file to write.
-        nodes: Command lines by name, in the order of their start. The one named "planner", if any, waits
-            until the recorder hears how the robot moves.
+        nodes: Command lines by name, in the order of their start.
         topics: Types of topics to record besides RECORDED_TOPICS.
         lockstep: Whether the nodes use simulated time.
         console: Console for output and bar.
@@ -77,7 +69,6 @@ class RecordedRun(ABC):
         columns = (TextColumn("{task.description:24}"), BarColumn(), TimeElapsedColumn())
         self._bar = Progress(*columns, console=console)
         self._output = PrefixedOutput(list(nodes), console)
-        self._waiting_planner = nodes.get(PLANNER, ())
         self._task = self._bar.add_task("start", total=total)
 
     @abstractmethod
@@ -142,15 +133,8 @@ class RecordedRun(ABC):
                     recorder.record(topic, kind)
                 with ProcessGroup(self._output) as group:
                     for name, line in self._nodes.items():
-                        if name != PLANNER:
-                            group.start(name, line)
-
-                    def record() -> None:
-                        recorder.serve(executor, POLL_PERIOD_S)
-                        if MEASURED in recorder.counts:
-                            self._start_planner(group)
-
-                    problem = self._wait(group, signals, record)
+                        group.start(name, line)
+                    problem = self._wait(group, signals, lambda: recorder.serve(executor, POLL_PERIOD_S))
         finally:
             node.destroy_node()
             rclpy.try_shutdown()
@@ -158,20 +142,11 @@ class RecordedRun(ABC):
             raise typer.Exit(128 + signals.received)
         return problem
 
-    def _start_planner(self, group: ProcessGroup) -> None:
-        """Start the planner, unless it has been, or there is none."""
-        if self._waiting_planner:
-            group.start(PLANNER, self._waiting_planner)
-            self._waiting_planner = ()
-
     def _wait(self, group: ProcessGroup, signals: StopSignals, record: Callable[[], None]) -> str:
         """Record until the run is complete, or a node ended unexpectedly."""
         watch, ended, failure = PageWatch(group, self._output), dict[str, int](), ""
-        planner_starts_by = time.monotonic() + MAX_WAIT_S
         while not (self.is_over(ended) or ended or failure or signals.received):
             record()
-            if time.monotonic() > planner_starts_by:
-                self._start_planner(group)
             ended, failure = watch.ended(), self.failure()
         if self.is_over(ended):
             self._bar.update(self._task, completed=self._bar.tasks[0].total, description="done")

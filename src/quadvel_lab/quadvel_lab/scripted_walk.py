@@ -12,7 +12,7 @@ from typing_extensions import override
 from quadvel_bringup.nodes import enclave, process_command
 from quadvel_eval.script import SCRIPTS
 
-from .recorded_run import PLANNER, RecordedRun
+from .recorded_run import RecordedRun
 
 PLANNED = {"/cmd_vel": "geometry_msgs/msg/Twist", "/planner/step": "std_msgs/msg/String"}
 
@@ -40,7 +40,7 @@ class ScriptedWalk(RecordedRun):
         self._steps = [step.name for step in SCRIPTS[script]]
         parameters = {"script": script, "use_sim_time": str(lockstep).lower()}
         arguments = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
-        planner = {PLANNER: process_command("planner", ["--ros-args", *enclave("planner"), *arguments])}
+        planner = {"planner": process_command("planner", ["--ros-args", *enclave("planner"), *arguments])}
         super().__init__(recording, {**nodes, **planner}, PLANNED, lockstep, console, len(self._steps))
 
     @override
@@ -52,7 +52,7 @@ class ScriptedWalk(RecordedRun):
     @override
     def is_over(self, ended: Mapping[str, int]) -> bool:
         # The planner, and no other process, ended with 0.
-        return dict(ended) == {PLANNER: 0}
+        return dict(ended) == {"planner": 0}
 
     def _on_step(self, message: Any) -> None:
         """Update the bar."""
