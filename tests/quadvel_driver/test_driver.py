@@ -356,6 +356,7 @@ def test_a_bad_parameter_ends_the_start_with_one_sentence(
     assert len(text.strip().splitlines()) == 1
 
 
+@pytest.mark.long  # Fast DDS may need longer than the driver looks for others
 def test_a_second_driver_refuses_to_start(
     start: Start, running: RunningBoard, controller: Controller
 ) -> None:
