@@ -36,7 +36,6 @@ SAME_TOLERANCE = 1e-3
 """Largest difference of equal commands, m/s or rad/s."""
 MAX_ESTIMATES = 10_000
 """Number of estimates for the mean, 50 s."""
-
 TWIST = "geometry_msgs/msg/Twist"
 """Type of the velocity commands."""
 

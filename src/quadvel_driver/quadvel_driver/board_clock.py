@@ -16,9 +16,7 @@ UNIT_WINDOW_S = 0.1  # length of the record from which the unit is identified
 MAX_RATE_RATIO = 10.0  # largest ratio of counter rate and nominal rate, either way
 OFFSET_WINDOW = 32  # states; the one with the least delay gives the offset of the clocks
 MAX_DELAY_JUMP_S = 0.01  # an arrival so much later than the fastest one means that a simulated board paused
-RESTART_TIMEOUT_S = (
-    0.1  # time without a newer state from which on an older counter means that the board restarted
-)
+RESTART_TIMEOUT_S = 0.1  # after so long without a newer state, an older counter means a restart
 MIN_TIME_STEP_S = 1e-6  # least time between two states
 _COUNTER_MODULUS = 2**32
 

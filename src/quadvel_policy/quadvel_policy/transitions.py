@@ -107,7 +107,8 @@ def _require_ended_path(now: Situation) -> str:
 
 def _require_nominal_posture(now: Situation) -> str:
     """The joints are near the nominal posture."""
-    return f"{now.posture_error}, request stand_up" if now.posture_error else ""
+    error = now.posture_error
+    return f"{error}, request stand_up" if error else ""
 
 
 def _require_other_posture(now: Situation) -> str:

@@ -81,7 +81,7 @@ class BadNetwork:
         """
         config = self._config
         # Always six uniform draws a packet, so that loss, duplicates, reordering and jitter do not
-        # change each other:
+        # change each other; bits are flipped by further draws:
         # arrival = now + delay + reordering + jitter * U(0, 1), with one jitter for each copy.
         loss, duplicate, reorder, corrupt, *jitters = self._rng.random(6)
         if loss < config.network_loss:
