@@ -39,7 +39,7 @@ def node() -> Node:
 def walk(node: Node, monkeypatch: pytest.MonkeyPatch) -> FollowedWalk:
     monkeypatch.setattr(follow_demo, "MAX_WAIT_S", 0.0)
     walk = FollowedWalk(Path("unused.mcap"), Stack(), (0.25, 0.0), 30.0, False, Console(quiet=True))
-    walk.listen(node)
+    walk.listen(node, {})
     return walk
 
 

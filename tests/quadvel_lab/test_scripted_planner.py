@@ -14,6 +14,7 @@ quadvel_dds.install()
 
 import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
 
 from quadvel_lab.scripted_planner import RETRY_INTERVAL_S, ScriptedPlanner  # noqa: E402
 from quadvel_msgs.msg import ControllerState  # noqa: E402
@@ -23,8 +24,8 @@ from quadvel_msgs.srv import SetMode  # noqa: E402
 class Controller:
     """Fake controller with a given mode and loop rate that records mode requests."""
 
-    def __init__(self) -> None:
-        rclpy.init(args=["test"])
+    def __init__(self, *parameters: str) -> None:
+        rclpy.init(args=["test", "--ros-args", *(word for name in parameters for word in ("-p", name))])
         self.node, self._planner = rclpy.create_node("controller"), ScriptedPlanner()
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._planner)
@@ -63,6 +64,22 @@ def controller() -> Iterator[Controller]:
     controller = Controller()
     yield controller
     controller.close()
+
+
+def test_a_waiting_script_starts_with_its_service() -> None:
+    controller = Controller("wait:=true")
+    try:
+        until = time.monotonic() + 3.0 * RETRY_INTERVAL_S
+        controller.publish_until(200.0, lambda: time.monotonic() > until)
+        assert controller.asked == []
+        start = controller.node.create_client(Trigger, "planner/start")
+        controller.publish_until(200.0, start.service_is_ready)
+        answer = start.call_async(Trigger.Request())
+        controller.publish_until(200.0, lambda: answer.done() and controller.asked)
+        assert answer.result().success
+        assert controller.asked[0] == "stand_up"
+    finally:
+        controller.close()
 
 
 def test_no_mode_is_requested_before_the_controller_receives_states(controller: Controller) -> None:

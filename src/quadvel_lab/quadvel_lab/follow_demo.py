@@ -83,7 +83,7 @@ class FollowedWalk(RecordedRun):
         self._created, self._last_state = time.monotonic(), "no state of the follow planner"
 
     @override
-    def listen(self, node: Any) -> None:
+    def listen(self, node: Any, recorded: Mapping[str, int]) -> None:
         from std_msgs.msg import String
 
         self._clock = node.get_clock()

@@ -72,11 +72,12 @@ class RecordedRun(ABC):
         self._task = self._bar.add_task("start", total=total)
 
     @abstractmethod
-    def listen(self, node: Any) -> None:
+    def listen(self, node: Any, recorded: Mapping[str, int]) -> None:
         """Subscribe to the topics that show the progress.
 
         Args:
             node: The recorder's node.
+            recorded: Number of recorded messages by topic so far; topics without one are not there.
         """
 
     @abstractmethod
@@ -123,12 +124,12 @@ class RecordedRun(ABC):
         executor.add_node(node)
         try:
             ensure_exclusive(node)
-            self.listen(node)
             with (
                 StopSignals() as signals,
                 Recorder(node, RecordingFile(self._recording)) as recorder,
                 self._bar,
             ):
+                self.listen(node, recorder.counts)
                 for topic, kind in {**RECORDED_TOPICS, **self._topics}.items():
                     recorder.record(topic, kind)
                 with ProcessGroup(self._output) as group:

@@ -9,6 +9,7 @@ import attrs
 from geometry_msgs.msg import Twist
 from rclpy.node import Node
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from quadvel_description.fields import field
 from quadvel_eval.script import SCRIPTS, ScriptError, ScriptRunner, Velocity
@@ -29,9 +30,11 @@ class PlannerParameters:
 
     Attributes:
         script: Name of the script, a key of SCRIPTS.
+        wait: Whether the script waits for the service `~/start`.
     """
 
     script: str = field("full", f"which script is walked: {' or '.join(SCRIPTS)}", one_of=SCRIPTS)
+    wait: bool = field(False, "whether the script waits for the service ~/start, as a recorder calls it")
 
 
 class ScriptedPlanner(Node):
@@ -41,6 +44,7 @@ class ScriptedPlanner(Node):
         super().__init__("planner")
         settings = read_parameters(self, PlannerParameters)
         self._runner = ScriptRunner(SCRIPTS[settings.script])
+        self._waits = settings.wait
         self._mode = self._reason = self._walk_refusal = self._step = ""
         self._next_request = 0.0  # earliest time of the next request, s of the monotonic clock
         self._velocity = self.create_publisher(Twist, "cmd_vel", 10)
@@ -48,6 +52,14 @@ class ScriptedPlanner(Node):
         self._set_mode = self.create_client(SetMode, "controller/set_mode")
         self.create_subscription(ControllerState, "controller/state", self._on_state, 10)
         self.create_timer(CMD_VEL_PERIOD_S, self._update)
+        # The last to be created, so that whoever finds it has found the topics.
+        self.create_service(Trigger, "~/start", self._on_start)
+
+    def _on_start(self, _: Any, response: Any) -> Any:
+        """Let the script start."""
+        self._waits = False
+        response.success, response.message = True, "the script runs"
+        return response
 
     def _on_state(self, message: Any) -> None:
         """Store the mode. The first report with a rate counts: before it the controller refuses requests."""
@@ -57,6 +69,8 @@ class ScriptedPlanner(Node):
 
     def _update(self) -> None:
         """Execute the next action of the script; end the node at its end or at an error."""
+        if self._waits:
+            return
         try:
             now = 1e-9 * self.get_clock().now().nanoseconds
             action = self._runner.update(now, self._mode, self._reason, self._walk_refusal)
