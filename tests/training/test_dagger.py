@@ -249,12 +249,12 @@ def test_commands_are_shifted_by_steady_errors_of_the_student_on_level_ground_al
     command[2, 3] = 1.0  # stands
     run.driven[:] = True
     run.driven[4] = False
-    run.teacher.past._age[:] = 5.0
+    run.teacher.past.age[:] = 5.0
     slope = np.zeros((8, 2))
     slope[6] = 0.1
     monkeypatch.setattr(type(run.env), "ground_slope", slope)
     assert np.flatnonzero(run._steady(command)).tolist() == [0]
-    run.teacher.past._age[0] = 0.5  # the plan has just reached the command
+    run.teacher.past.age[0] = 3.0  # the student still settles
     assert not run._steady(command).any()
 
 

@@ -73,6 +73,8 @@ MIRRORS = tuple(torch_mirror(mirror) for mirror in (symmetry.OBSERVATION, symmet
 """Of observations, actions, and what the teacher observes of the past"""
 LEVEL_SLOPE = 0.1  # m/m: steady errors on steeper ground do not shift commands
 SLOW_CELLS, LONGEST_MEMORY_S = MEMORY // 4, 4.0  # cells of a new student that forget slowly, up to this time
+STEADY_AFTER_S = 4.0
+"""Age of a command from which errors count as steady: the student settles as the teacher's integrals do"""
 SHORTEST_STEADY_S = 0.5  # of a sequence in which a robot is steady, for its mean error to count
 QUIET = 2  # every second robot does not explore
 AVERAGED_TICKS = 3
@@ -501,10 +503,11 @@ class DaggerRun:
     def _steady(self, command: np.ndarray) -> np.ndarray:
         """Whether the errors of robots (n,) show what the student does at a command, and not what else happens.
 
-        The student drives them without exploration, the plan has the command for long, and the ground
-        is level: robots that explore or climb are slower.
+        The student drives them without exploration, the plan has had the command for
+        `STEADY_AFTER_S`, and the ground is level: robots that explore or climb are slower.
         """
-        steady = self.driven & ~self._explores & self.teacher.past.settled & (command[:, 3] < 0.5)
+        is_settled = self.teacher.past.age > STEADY_AFTER_S
+        steady = self.driven & ~self._explores & is_settled & (command[:, 3] < 0.5)
         return np.asarray(steady & (np.hypot(*self.env.ground_slope.T) < LEVEL_SLOPE))
 
     def _figures(self, alive: np.ndarray, fell: np.ndarray) -> dict[str, float]:
