@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_policy.observation import VelocityCommandLimits  # noqa: E402
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
-from quadvel_training import dagger, loop, privileged  # noqa: E402
+from quadvel_training import command_shift, dagger, loop, privileged, teacher  # noqa: E402
 from quadvel_training.dagger import DaggerConfig, DaggerRun  # noqa: E402
 from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun  # noqa: E402
 from tests.helpers.robots import ALIENGO  # noqa: E402
@@ -101,8 +101,8 @@ def test_a_label_is_the_mean_of_the_actions_around_its_tick_while_the_robot_is_u
     actions = np.random.default_rng(0).standard_normal((30, 2, 12)).astype(np.float32)
     mask = np.ones((30, 2), np.float32)
     mask[20:, 1] = 0.0
-    labels = dagger.smooth_labels(actions, mask)
-    before, after = dagger.LABEL_BEFORE, dagger.LABEL_AFTER
+    labels = teacher.smooth_labels(actions, mask)
+    before, after = teacher.LABEL_BEFORE, teacher.LABEL_AFTER
     assert labels[10, 0] == pytest.approx(actions[10 - before : 11 + after, 0].mean(axis=0), abs=1e-6)
     assert labels[0, 0] == pytest.approx(actions[: 1 + after, 0].mean(axis=0), abs=1e-6)
     assert labels[19, 1] == pytest.approx(actions[19 - before : 20, 1].mean(axis=0), abs=1e-6)
@@ -112,8 +112,8 @@ def test_a_label_is_the_mean_of_the_actions_around_its_tick_while_the_robot_is_u
 def test_labels_do_not_jump_where_the_teacher_does():
     jump = np.zeros((30, 1, 12), np.float32)
     jump[15:] = 1.0
-    steps = np.diff(dagger.smooth_labels(jump, np.ones((30, 1), np.float32))[:, 0, 0])
-    assert steps.max() == pytest.approx(1 / (1 + dagger.LABEL_BEFORE + dagger.LABEL_AFTER))
+    steps = np.diff(teacher.smooth_labels(jump, np.ones((30, 1), np.float32))[:, 0, 0])
+    assert steps.max() == pytest.approx(1 / (1 + teacher.LABEL_BEFORE + teacher.LABEL_AFTER))
 
 
 def test_who_drives_changes_with_an_episode_alone(run):
@@ -261,7 +261,7 @@ def test_commands_are_shifted_by_steady_errors_of_the_student_on_level_ground_al
 def test_commands_are_shifted_by_the_mean_error_since_the_last_command(run, monkeypatch):
     """Robots are at rest: the error is the command."""
     added = []
-    monkeypatch.setattr(dagger, "SHORTEST_STEADY_S", 3.5 * dagger.TICK_S)
+    monkeypatch.setattr(command_shift, "SHORTEST_STEADY_S", 3.5 * dagger.TICK_S)
     monkeypatch.setattr(run, "_steady", lambda command: np.arange(8) < 3)
     monkeypatch.setattr(run.teacher.shift, "add", lambda command, error: added.append((command, error)))
     run.env.command[:] = [0.8, 0.0, 0.0, 0.0]

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 
 from . import process_group
+from .env import TICK_S
 
 SCALES = np.array([2.0, 1.0, 3.0])  # m/s, m/s, rad/s: commands of usual size, so that features are about 1
 MAX_ERROR = np.array([0.1, 0.1, 0.2])  # m/s, m/s, rad/s: larger ones count as this
@@ -42,6 +43,7 @@ PRODUCTS = [
 ]
 FEATURES = sum(len(knots) - 1 for knots in KNOTS) + len(PRODUCTS)
 GAIN = 0.3  # share of the mean error by which the shift grows; the student needs millions of samples to follow it
+SHORTEST_STEADY_S = 0.5  # of a sequence in which a robot is steady, for its mean error to count
 RIDGE = 5.0  # robots that walk at the usual commands with no error
 
 
@@ -119,6 +121,51 @@ class CommandShift:
         """
         self._weights = np.array(state["weights"])
         self._start_over()
+
+
+class Drift:
+    """Mean velocity errors of robots while they are steady at their present command.
+
+    Attributes:
+        seconds: (n,), time for which each was steady.
+        integral: (n, 3), of its errors over that time, m, m, rad.
+    """
+
+    def __init__(self, n: int) -> None:
+        """Begin.
+
+        Args:
+            n: number of robots.
+        """
+        self.seconds, self.integral = np.zeros(n), np.zeros((n, 3))
+
+    def advance(self, error: np.ndarray, steady: np.ndarray, changed: np.ndarray) -> None:
+        """Count a tick.
+
+        Args:
+            error: (n, 3), command minus velocity, m/s, m/s, rad/s.
+            steady: (n,) bool, whether the tick counts.
+            changed: (n,) bool, whether the command has changed, so that the robot begins again.
+        """
+        self.seconds += TICK_S * steady
+        self.integral += TICK_S * steady[:, None] * error
+        self.seconds[changed], self.integral[changed] = 0.0, 0.0
+
+    @property
+    def is_known(self) -> np.ndarray:
+        """Whether each robot was steady for long enough, (n,) bool."""
+        return np.asarray(self.seconds > SHORTEST_STEADY_S)
+
+    def mean(self, robots: np.ndarray) -> np.ndarray:
+        """Mean errors of some robots.
+
+        Args:
+            robots: (n,) bool, robots whose drift is known.
+
+        Returns:
+            (k, 3), m/s, m/s, rad/s.
+        """
+        return np.asarray(self.integral[robots] / self.seconds[robots, None])
 
 
 def _features(command: np.ndarray) -> np.ndarray:

@@ -34,6 +34,7 @@ from .ppo import RECURRENT_PPO, Ppo, PpoConfig, Rollout, exploration_scales
 from .privileged import CommandScorer
 from .randomisation import Randomisation, load_actuator
 from .rewards import RewardWeights, Table2
+from .teacher import Teacher
 from .walking_rewards import error_magnitudes
 
 CRITIC_SIZE = (
@@ -154,7 +155,7 @@ class ConstrainedRun:
         self.shift = CommandShift(dagger.SHIFT_SEQUENCES)
         if "shift" in known:
             self.shift.restore(known["shift"])
-        self.teacher = dagger.Teacher(load(teacher), self.env, self.shift) if teacher else None
+        self.teacher = Teacher(load(teacher), self.env, self.shift) if teacher else None
         self.rewards = Table2(self.env, c.rewards)
         self.scorer = CommandScorer(c.n)
         network = dagger.load_policy(start) if start else Recurrent(OBSERVATION_SIZE, 12)

@@ -1,0 +1,150 @@
+"""The teacher as stage 2 evaluates it: at every tick, with averaged actions, for labels without jumps."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+import torch
+
+from quadvel_description import symmetry
+
+from . import privileged
+from .command_shift import CommandShift
+from .env import TICK_S, VelocityEnv
+from .past import Past
+from .privileged import ACTION_BOUND
+from .walking_rewards import SAMPLE_S
+
+HOLD_TICKS = round(SAMPLE_S / TICK_S)  # the teacher learned with actions held for so long
+PAST_MIRROR = symmetry.concatenate_mirrors(
+    [
+        privileged.PLANAR,  # error over a stride
+        privileged.PLANAR,  # lasting error
+        symmetry.sign_mirror(1, -1),  # lag
+        symmetry.sign_mirror(-1, -1),  # phase of the steps
+        privileged.PLANAR,  # planned velocity
+    ]
+)
+PAST_SIZE = len(PAST_MIRROR.index)  # what the teacher observes of the past
+AVERAGED_TICKS = 3
+"""Ticks over which a teacher that drives averages its actions: held actions act late by as much"""
+LABEL_BEFORE, LABEL_AFTER = 3, 1
+"""Ticks before and after its own that a label averages: as late as `AVERAGED_TICKS`, and without jumps"""
+
+
+class Teacher:
+    """Teacher of a checkpoint, evaluated at every tick, with averaged actions and shifted commands.
+
+    Actions are averaged over `AVERAGED_TICKS`, because it learned with actions held for 20 ms.
+    Evaluated at every tick without the average, it falls where it does not fall otherwise (decision
+    43).
+
+    Attributes:
+        actor: policy of the teacher.
+        env: environments.
+        shift: what it follows beyond the commands.
+        past: past of the robots, relative to the shifted commands.
+        latest: (n, 12), last action before the average, in the network's unit.
+    """
+
+    def __init__(self, checkpoint: dict[str, Any], env: VelocityEnv, shift: CommandShift) -> None:
+        """Load the teacher.
+
+        Args:
+            checkpoint: content of a checkpoint of `privileged`.
+            env: environments.
+            shift: what it follows beyond the commands.
+        """
+        self.actor = privileged.load_teacher(checkpoint)
+        self.env, self.shift, self.past = env, shift, Past(env)
+        n = env.config.n
+        self._executed = deque([np.zeros((n, 12), np.float32) for _ in range(HOLD_TICKS)], HOLD_TICKS)
+        self._recent = np.zeros((AVERAGED_TICKS, n, 12), np.float32)  # newest first
+        self._starts = np.ones(n, bool)
+        self.latest = np.zeros((n, 12), np.float32)
+
+    def reset(self, ids: np.ndarray) -> None:
+        """Clear the past of some robots.
+
+        Args:
+            ids: their indices.
+        """
+        self.past.reset(ids)
+        for action in self._executed:
+            action[ids] = 0.0
+        self._starts[ids] = True
+
+    def action(self) -> np.ndarray:
+        """Evaluate the teacher; call it once per tick.
+
+        Returns:
+            (n, 12), action in the network's unit.
+        """
+        command = self.env.command + self.shift.of(self.env.command)
+        obs = privileged.observe(self.env, self.past, self._executed[0], command)
+        with torch.no_grad():
+            correction: np.ndarray = self.actor(torch.from_numpy(obs))[0].numpy()
+        self.latest = now = privileged.total_action(self.env, self.past, correction)
+        self._recent = np.concatenate([now[None], self._recent[:-1]])
+        self._recent[:, self._starts] = now[self._starts]
+        self._starts[:] = False
+        mean: np.ndarray = self._recent.mean(axis=0)
+        return mean
+
+    def advance(self, command: np.ndarray, executed: np.ndarray) -> None:
+        """Record a tick.
+
+        Args:
+            command: (n, 4), command that was in force.
+            executed: (n, 12), actions taken, in the network's unit.
+        """
+        self.past.advance(command + self.shift.of(command))
+        self._executed.append(executed.clip(-ACTION_BOUND, ACTION_BOUND))
+
+    def past_features(self) -> np.ndarray:
+        """Return what the teacher observes of the past, which a memory has to keep.
+
+        Returns:
+            (n, PAST_SIZE), scaled to about 1: errors over a stride and lasting ones, lag, plan.
+        """
+        past = self.past
+        return np.concatenate(
+            [3 * past.stride, 12 * past.lasting, 8 * past.lag, past.clock.observation()], axis=1
+        ).astype(np.float32)
+
+    def stride_error(self) -> np.ndarray:
+        """Compute the error over a stride, relative to the commands as they are.
+
+        Returns:
+            (n, 3), command minus velocity in vx, vy (m/s) and yaw rate (rad/s).
+        """
+        error: np.ndarray = self.past.stride - self.shift.of(self.env.command)[:, :3]
+        return error
+
+
+def smooth_labels(actions: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Average the teacher's actions around each tick.
+
+    The teacher's targets jump where it plans a touchdown or a lift-off, and its student would copy the
+    jumps. It sees them come, so actions after a tick count as well: the mean is no later than the
+    causal one with which the teacher drives.
+
+    Args:
+        actions: (T, N, 12), actions of the teacher.
+        mask: (T, N), 1 for robots that are up; actions of others do not count.
+
+    Returns:
+        (T, N, 12), means over `LABEL_BEFORE` ticks before to `LABEL_AFTER` after, as far as there are.
+    """
+    ticks = np.arange(len(actions))
+    first, last = np.maximum(ticks - LABEL_BEFORE, 0), np.minimum(ticks + LABEL_AFTER, len(actions) - 1)
+
+    def window_sum(values: np.ndarray) -> np.ndarray:
+        """Sum of the values (T, N, k) in the window of each tick."""
+        running = np.concatenate([np.zeros_like(values[:1], float), values.cumsum(axis=0, dtype=float)])
+        return np.asarray(running[last + 1] - running[first])
+
+    count = np.maximum(window_sum(mask[..., None]), 1.0)
+    return np.asarray(window_sum(actions * mask[..., None]) / count, np.float32)
