@@ -92,6 +92,7 @@ def check_stack(stack: Stack) -> None:
     _check_file(stack.parameters)
     arguments = stack.arguments()
     checked = [name for name in arguments if name in NODE_CHECKS]
+    _check_values_of_file(stack.parameters, checked)
     # The controller comes first: a robot without a policy needs no estimator.
     settings = {name: check_node(name, arguments[name]) for name in sorted(checked, key="controller".__ne__)}
     _check_same_robot({name: settings[name].robot for name in checked if hasattr(settings[name], "robot")})
@@ -162,6 +163,16 @@ def _check_file(file: Path) -> None:
         raise ValueError(f"{file}: {error}") from None
 
 
+def _check_values_of_file(file: Path, names: Iterable[str]) -> None:
+    """Check types and ranges of the values that a parameter file gives to nodes."""
+    found = parse(["--ros-args", "--params-file", str(file)])
+    for name in names:
+        try:
+            _record(name, NODE_CHECKS[name], found.parameters_for(f"/{name}"))
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}") from None
+
+
 def _check_names(overrides: Iterable[ParameterOverride], nodes: Mapping[str, str], running: str = "") -> None:
     """Check names of nodes and parameters.
 
@@ -203,7 +214,17 @@ def _hint(found: str, known: Iterable[str]) -> str:
 
 
 def _check(name: str, part: NodeCheck, values: Mapping[str, Any]) -> Any:
-    """Check names, types and values of the parameters of a node; return their record."""
+    """Check the parameters of a node, and that it can be made from them; return their record."""
+    settings = _record(name, part, values)
+    try:
+        part.make(settings)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error.args[0]}") from error
+    return settings
+
+
+def _record(name: str, part: NodeCheck, values: Mapping[str, Any]) -> Any:
+    """Check names, types and ranges of the parameters of a node; return their record."""
     module, _, record = part.record.partition(":")
     kind = getattr(import_module(module), record)
     defaults = {name: field.default for name, field in parameter_fields(kind).items()}
@@ -218,8 +239,6 @@ def _check(name: str, part: NodeCheck, values: Mapping[str, Any]) -> Any:
             raise ValueError(f"{name}: {parameter} is {value!r}, expected a {expected}")
     given = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items() if key in defaults}
     try:
-        settings = make_record(kind, given)
-        part.make(settings)
-        return settings
+        return make_record(kind, given)
     except ValueError as error:
         raise ValueError(f"{name}: {error.args[0]}") from error
