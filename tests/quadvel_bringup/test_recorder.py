@@ -201,8 +201,8 @@ def test_a_full_disk_ends_a_recording_in_words_and_what_was_written_is_read(
         assert len(list(read_messages(path, lambda topic, typename: True))) > 50
 
 
-def test_a_recording_on_which_nothing_came_leaves_no_file(tmp_path: Path) -> None:
-    recording = start_recording("low_state", "--out", str(tmp_path / "walk.mcap"), "--seconds", "0.5")
+def test_a_recording_on_which_nothing_came_leaves_neither_file_nor_folder(tmp_path: Path) -> None:
+    recording = start_recording("low_state", "--out", str(tmp_path / "new" / "walk.mcap"), "--seconds", "0.5")
     _, said = recording.communicate(timeout=60)
     assert recording.returncode == 1
     assert "no message on /low_state on ROS domain" in said

@@ -13,7 +13,7 @@ from typing import Any
 from rich.console import Console
 
 import quadvel_dds
-from quadvel_recordings.output import output_folder, output_recording
+from quadvel_recordings.output import created_folder, output_folder, output_recording
 from quadvel_recordings.reading import DESCRIPTION_TOPIC
 
 from .exclusivity import ros_domain
@@ -45,15 +45,35 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
         OSError: The disk is full.
     """
     output_recording(path)
+    console, wanted = Console(stderr=True, soft_wrap=True), _absolute(topics)
+    with created_folder(path.parent):
+        counts, present = _record_until(path, wanted, seconds, console)
+        is_empty = not counts.keys() - ({DESCRIPTION_TOPIC} - set(wanted))
+        if is_empty:
+            path.unlink()
+    if is_empty:
+        sought = ", ".join(wanted) or "any topic"
+        advice = _spelling(wanted, present) or "is a robot running, and its simulator not paused?"
+        console.print(
+            f"no message on {sought} on ROS domain {ros_domain()}; {path} was not written; {advice}"
+        )
+        return 0
+    for topic in sorted(set(wanted) - counts.keys()):
+        console.print("; ".join(filter(None, [f"no message on {topic}", _spelling([topic], present)])))
+    console.print(f"{path}: {_summary(counts)}")
+    return counts.total()
+
+
+def _record_until(
+    path: Path, wanted: Sequence[str], seconds: float | None, console: Console
+) -> tuple[Counter[str], list[str]]:
+    """Record `wanted` topics; return the number of messages by topic, and the topics that there were."""
     quadvel_dds.install()
     from .recorder import Recorder
     from .recording_file import RecordingFile
     from .session import DISCOVERY_TIMEOUT_S, Session
 
-    console = Console(stderr=True, soft_wrap=True)
-    wanted = _absolute(topics)
-    discovered_by = time.monotonic() + DISCOVERY_TIMEOUT_S
-    ends = float("inf")
+    discovered_by, ends = time.monotonic() + DISCOVERY_TIMEOUT_S, float("inf")
     with (
         StopSignals() as signals,
         console.status("recording; Ctrl-C stops") as status,
@@ -68,22 +88,10 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
                 is_heard = recorder.counts.keys() >= set(wanted) if wanted else recorder.counts
                 if ends == float("inf") and (is_heard or time.monotonic() > discovered_by):
                     ends = _end(seconds)
-            present = [topic for topic, _ in session.node.get_topic_names_and_types()]
+            return recorder.counts, [topic for topic, _ in session.node.get_topic_names_and_types()]
         except OSError as error:
             written = f"after {_summary(recorder.counts)}; about the last second of them is unreadable"
             raise OSError(f"{path}: the recording ended {written}: {error.strerror}") from error
-    if not recorder.counts.keys() - ({DESCRIPTION_TOPIC} - set(wanted)):
-        path.unlink()
-        sought = ", ".join(wanted) or "any topic"
-        advice = _spelling(wanted, present) or "is a robot running, and its simulator not paused?"
-        console.print(
-            f"no message on {sought} on ROS domain {ros_domain()}; {path} was not written; {advice}"
-        )
-        return 0
-    for topic in sorted(set(wanted) - recorder.counts.keys()):
-        console.print("; ".join(filter(None, [f"no message on {topic}", _spelling([topic], present)])))
-    console.print(f"{path}: {_summary(recorder.counts)}")
-    return recorder.counts.total()
 
 
 def record_faults(folder: Path, topics: Sequence[str], before: float, seconds: float | None) -> bool:
