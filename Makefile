@@ -21,7 +21,7 @@ BUILD_INTERFACES := ros_ws/wheels/build_interfaces.py
 INTERFACES := $(BUILD_INTERFACES) $(wildcard src/quadvel_msgs/*/* ros_ws/wheels/*/*/*)
 INSTALL = -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable
 
-.PHONY: help setup ros demo close-the-loop paper faults test ros-tests test-ros lint format docs pictures bench lock clean
+.PHONY: help setup ros demo close-the-loop paper faults test tutorials ros-tests test-ros lint format docs pictures bench lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -41,6 +41,9 @@ ros: $(ROS_VENV)/.run  ## create .venv-ros with ROS 2's own rclpy; needs no ROS 
 
 test: $(VENV)/.test  ## install the test dependencies (torch too) and run the tests
 	$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+tutorials: $(VENV)/.test  ## run every cell of the site's pages
+	$(PY) -m pytest -m tutorial tests/end_to_end/test_tutorials.py
 
 ros-tests: $(ROS_VENV)/.test
 

@@ -216,7 +216,7 @@ def examples() -> dict[str, str]:
 def _blocks(text: str) -> Iterator[str]:
     """The lines of indented blocks, which follow an empty line, and of fenced ones; continued lines are joined.
 
-    Left out are diagrams, and directives of the site: `make docs` runs the cells of its tutorials.
+    Left out are diagrams, and directives of the site: `make tutorials` runs its cells.
     """
     text = re.sub(r"^```(?:mermaid$|\{).*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
     text = re.sub(r" *\\\n *", " ", text)

@@ -163,7 +163,7 @@ class ActuatorParameters:
         if not some_joints and len(names := parameters.joints or JOINT_NAMES) != len(JOINT_NAMES):
             raise ValueError(
                 f"{path}: joints: found {len(names)} ({', '.join(names)}), expected all {len(JOINT_NAMES)} of the "
-                "robot: identify it without --joints"
+                "robot: identify logs of all of them, without --joints"
             )
         return parameters
 
