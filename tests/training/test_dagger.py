@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_policy.observation import VelocityCommandLimits  # noqa: E402
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
-from quadvel_training import command_shift, dagger, loop, privileged, teacher  # noqa: E402
+from quadvel_training import dagger, loop, privileged, teacher  # noqa: E402
 from quadvel_training.dagger import DaggerConfig, DaggerRun  # noqa: E402
 from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun  # noqa: E402
 from tests.helpers.robots import ALIENGO  # noqa: E402
@@ -242,30 +242,3 @@ def test_every_second_robot_does_not_explore(run):
     run.collect()
     assert not run._noise[::2].any()
     assert run._noise[1::2].any(axis=1).all()
-
-
-def test_commands_are_shifted_by_steady_errors_of_the_student_on_level_ground_alone(run, monkeypatch):
-    command = np.tile([0.5, 0.0, 0.0, 0.0], (8, 1))
-    command[2, 3] = 1.0  # stands
-    run.driven[:] = True
-    run.driven[4] = False
-    run.teacher.past.age[:] = 5.0
-    slope = np.zeros((8, 2))
-    slope[6] = 0.1
-    monkeypatch.setattr(type(run.env), "ground_slope", slope)
-    assert np.flatnonzero(run._steady(command)).tolist() == [0]
-    run.teacher.past.age[0] = 3.0  # the student still settles
-    assert not run._steady(command).any()
-
-
-def test_commands_are_shifted_by_the_mean_error_since_the_last_command(run, monkeypatch):
-    """Robots are at rest: the error is the command."""
-    added = []
-    monkeypatch.setattr(command_shift, "SHORTEST_STEADY_S", 3.5 * dagger.TICK_S)
-    monkeypatch.setattr(run, "_steady", lambda command: np.arange(8) < 3)
-    monkeypatch.setattr(run.teacher.shift, "add", lambda command, error: added.append((command, error)))
-    run.env.command[:] = [0.8, 0.0, 0.0, 0.0]
-    run.collect()
-    ((command, error),) = added
-    assert command.shape == (3, 4)
-    assert error[:, 0] == pytest.approx(command[:, 0], abs=0.3)

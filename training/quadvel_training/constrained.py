@@ -25,7 +25,6 @@ from quadvel_sim.terrain import Terrain
 
 from . import dagger, privileged, process_group
 from .command_grid import CommandGrid, GridConfig
-from .command_shift import CommandShift
 from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, TimeShares, linear, load
 from .networks import Gaussian, Mlp, Recurrent, State, follow_weights, torch_mirror
@@ -152,10 +151,7 @@ class ConstrainedRun:
         )
         self.env = VelocityEnv(env_config, self.grid)
         self.past = Past(self.env)
-        self.shift = CommandShift(dagger.SHIFT_SEQUENCES)
-        if "shift" in known:
-            self.shift.restore(known["shift"])
-        self.teacher = Teacher(load(teacher), self.env, self.shift) if teacher else None
+        self.teacher = Teacher(load(teacher), self.env) if teacher else None
         self.rewards = Table2(self.env, c.rewards)
         self.scorer = CommandScorer(c.n)
         network = dagger.load_policy(start) if start else Recurrent(OBSERVATION_SIZE, 12)
@@ -212,7 +208,6 @@ class ConstrainedRun:
             "critic": self.critic.state_dict(),
             "learner": self.ppo.state(),
             "grid": self.grid.state(),
-            "shift": self.shift.state(),
             "samples": self.samples,
             "updates": self.updates,
             "random": {"learner": torch.get_rng_state(), "environments": self.env.rng.bit_generator.state},
@@ -229,7 +224,6 @@ class ConstrainedRun:
         self.critic.load_state_dict(state["critic"])
         self.ppo.restore(state["learner"])
         self.grid.restore(state["grid"])
-        self.shift.restore(state["shift"])
         self.samples, self.updates = state["samples"], state["updates"]
         process_group.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))

@@ -10,8 +10,7 @@ robots would stay with a student that falls soon.
 
 The student has to remember what the teacher observes of the past: errors over a stride and over
 seconds, and the phase of its steps. So its sequences last for seconds, and a linear map from its
-memory, which is not part of the policy, learns to predict these numbers. What is left of its steady
-errors the teacher removes by shifted commands (`command_shift`).
+memory, which is not part of the policy, learns to predict these numbers.
 
 Half of the sequences are learned as their mirror images, so that the student walks alike to both
 sides. Robots that stand are left out there: whoever answers left and right alike cannot choose the
@@ -46,12 +45,10 @@ from quadvel_sim.terrain import Terrain
 
 from . import process_group
 from .command_grid import CommandGrid, GridConfig
-from .command_shift import CommandShift, Drift
 from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, CheckpointError, cosine, linear, load, set_rate
 from .networks import MEMORY, Recurrent, State, follow_weights, lengthen_memory, select, torch_mirror
 from .onnx_file import commit, export
-from .past import velocity_error
 from .ppo import IMITATION_HUBER_DELTA, masked_mean
 from .privileged import ACTION_BOUND, ACTION_SCALE
 from .randomisation import Randomisation, load_actuator
@@ -60,12 +57,8 @@ from .walking_rewards import error_magnitudes
 
 MIRRORS = tuple(torch_mirror(mirror) for mirror in (symmetry.OBSERVATION, symmetry.JOINTS, PAST_MIRROR))
 """Of observations, actions, and what the teacher observes of the past"""
-LEVEL_SLOPE = 0.1  # m/m: steady errors on steeper ground do not shift commands
 SLOW_CELLS, LONGEST_MEMORY_S = MEMORY // 4, 4.0  # cells of a new student that forget slowly, up to this time
-STEADY_AFTER_S = 4.0
-"""Age of a command from which errors count as steady: the student settles as the teacher's integrals do"""
 QUIET = 2  # every second robot does not explore
-SHIFT_SEQUENCES = 8  # from one change of the shifted commands to the next: a million samples of 512 robots
 
 
 @attrs.frozen
@@ -77,7 +70,7 @@ class DaggerConfig:
         budget: when the run ends.
         n: number of robots, of all processes together.
         threads: threads of the physics.
-        length: ticks per sequence; 256 are 1.28 s, and more than 100 shift commands.
+        length: ticks per sequence; 256 are 1.28 s.
         epochs: passes over each sequence.
         mini_batches: optimiser steps per pass.
         learning_rate: learning rate of Adam at the start.
@@ -189,7 +182,7 @@ class DaggerRun:
             randomisation=c.randomisation,
         )
         self.env = VelocityEnv(env_config, self.grid)
-        self.teacher = Teacher(checkpoint, self.env, CommandShift(SHIFT_SEQUENCES))
+        self.teacher = Teacher(checkpoint, self.env)
         self.student = Recurrent(OBSERVATION_SIZE, 12)
         lengthen_memory(self.student.lstm, SLOW_CELLS, LONGEST_MEMORY_S / TICK_S)
         self.average = copy.deepcopy(self.student)
@@ -218,7 +211,6 @@ class DaggerRun:
             "recall": self.recall.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "grid": self.grid.state(),
-            "shift": self.teacher.shift.state(),
             "samples": self.samples,
             "random": {"learner": torch.get_rng_state(), "environments": self.env.rng.bit_generator.state},
         }
@@ -234,7 +226,6 @@ class DaggerRun:
         self._sequences = state["sequences"]
         self.recall.load_state_dict(state["recall"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.teacher.shift.restore(state["shift"])
         self.samples = state["samples"]
         process_group.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
@@ -296,7 +287,6 @@ class DaggerRun:
         """
         c = self.config
         alive, fell = np.ones(c.n, bool), np.zeros(c.n, bool)
-        drift = Drift(c.n)
         rows: dict[str, list[np.ndarray]] = {name: [] for name in attrs.fields_dict(Experience)}
         standing = []
         for _ in range(c.length):
@@ -305,13 +295,10 @@ class DaggerRun:
             for values, value in zip(rows.values(), seen, strict=True):
                 values.append(value)
             standing.append(self._stands())
-            command = self._tick(obs, advice)
-            drift.advance(velocity_error(self.env, command), self._steady(command), self.env.changed)
+            self._tick(obs, advice)
             fell |= self.env.fallen & alive
             alive &= ~(self.env.fallen | self.env.timed_out)
-        figures = self._figures(alive, fell)  # with the shift that was in force
-        counts = alive & drift.is_known
-        self.teacher.shift.add(self.env.command[counts], drift.mean(counts))
+        figures = self._figures(alive, fell)
         rows["mask"][-1] = alive  # robots that end in the last tick count as ended, too
         self.samples += c.length * c.n * process_group.size()
         arrays = {name: np.array(values, dtype=np.float32) for name, values in rows.items()}
@@ -320,15 +307,12 @@ class DaggerRun:
         stood = torch.from_numpy(np.array(standing, dtype=np.float32))
         return Experience(**tensors), stood, figures
 
-    def _tick(self, obs: np.ndarray, advice: np.ndarray) -> np.ndarray:
+    def _tick(self, obs: np.ndarray, advice: np.ndarray) -> None:
         """Advance the robots by a tick, each with its driver's action and its exploration.
 
         Args:
             obs: (n, 48), observations of the student.
             advice: (n, 12), actions of the teacher, in the network's unit.
-
-        Returns:
-            (n, 4), command that was in force.
         """
         env, c = self.env, self.config
         # Ornstein-Uhlenbeck noise: n <- d n + noise sqrt(1 - d^2) w, d = exp(-dt / noise_time)
@@ -341,7 +325,6 @@ class DaggerRun:
         command = env.command.copy()
         env.tick(self.map.targets(self._previous))
         self.teacher.advance(command, self._previous)
-        return command
 
     def _stands(self) -> np.ndarray:
         """Whether robots (n,) stand, or have not lifted a foot since they stood."""
@@ -349,19 +332,9 @@ class DaggerRun:
         self._setting_off &= ~(past.air > past.clock.shortest_swing).any(axis=1)
         return np.asarray(past.standing | self._setting_off)
 
-    def _steady(self, command: np.ndarray) -> np.ndarray:
-        """Whether the errors of robots (n,) show what the student does at a command, and not what else happens.
-
-        The student drives them without exploration, the plan has had the command for
-        `STEADY_AFTER_S`, and the ground is level: robots that explore or climb are slower.
-        """
-        is_settled = self.teacher.past.age > STEADY_AFTER_S
-        steady = self.driven & ~self._explores & is_settled & (command[:, 3] < 0.5)
-        return np.asarray(steady & (np.hypot(*self.env.ground_slope.T) < LEVEL_SLOPE))
-
     def _figures(self, alive: np.ndarray, fell: np.ndarray) -> dict[str, float]:
         """Return errors over a stride (m/s, rad/s) and falls per robot-minute, by driver."""
-        error = self.teacher.stride_error()
+        error = self.teacher.past.stride
         seen = {"driven": float(self.driven.mean())}
         for name, driver in (("student", self.driven), ("teacher", ~self.driven)):
             up, minutes = driver & alive, driver.sum() * self.config.length * TICK_S / 60

@@ -27,7 +27,6 @@ class Past:
         lasting: (n, 3), the same over `LASTING_S`; set to zero by a new command, it changes while
             the robot is `settled`.
         lag: (n, 2), m, the integral of the error in vx and vy, over the same time as `lasting`.
-        age: (n,), s for which the plan has had the commanded velocity.
         air: (n, 4), s since the foot left the ground; 0 on the ground.
         down: (n, 4), s since the foot touched the ground; 0 in the air.
         clock: plan of the steps.
@@ -46,7 +45,7 @@ class Past:
         self.stride, self.lasting, self.lag = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 2))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
         self.off_hip, self.clock = np.zeros((n, 4)), GaitClock(n, env.size)
-        self.age = np.zeros(n)  # s, since the plan has the commanded velocity
+        self._age = np.zeros(n)  # s, since the plan has the commanded velocity
         self._landed, self._last = np.zeros((n, 4)), np.zeros((n, 4))  # m ahead of the hip: at touchdown, now
 
     def reset(self, ids: np.ndarray) -> None:
@@ -55,7 +54,7 @@ class Past:
         Args:
             ids: their indices.
         """
-        for array in (self.stride, self.lasting, self.lag, self.air, self.down, self.off_hip, self.age):
+        for array in (self.stride, self.lasting, self.lag, self.air, self.down, self.off_hip, self._age):
             array[ids] = 0.0
         self.clock.reset(ids)
 
@@ -69,11 +68,11 @@ class Past:
         # First-order low-pass filters: x <- x + (e - x) dt / T
         error = velocity_error(env, command)
         self.stride += (error - self.stride) * period / STRIDE_S
-        self.age += period * (self.clock.velocity == command[:, :3]).all(axis=1)
+        self._age += period * (self.clock.velocity == command[:, :3]).all(axis=1)
         settled = self.settled[:, None]
         self.lasting += (error - self.lasting) * settled * period / LASTING_S
         self.lag = np.clip(self.lag + error[:, :2] * settled * period, -MAX_LAG_M, MAX_LAG_M)
-        for array in (self.lasting, self.lag, self.age):
+        for array in (self.lasting, self.lag, self._age):
             array[env.changed] = 0.0
         self._advance_stances()
         speed = np.hypot(env.velocity[:, 0], env.velocity[:, 1])
@@ -92,7 +91,7 @@ class Past:
     @property
     def settled(self) -> np.ndarray:
         """Whether the plan has had the commanded velocity for `TRANSIENT_S`, (n,) bool."""
-        return np.asarray(self.age > TRANSIENT_S)
+        return np.asarray(self._age > TRANSIENT_S)
 
     @property
     def standing(self) -> np.ndarray:

@@ -67,9 +67,7 @@ STATE_SIZE = OBSERVATION_SIZE - 5  # without the plan
 CRITIC_EXTRA_SIZE = 4 + 4 + 1
 
 
-def observe_state(
-    env: VelocityEnv, past: Past, previous: np.ndarray, command: np.ndarray | None = None
-) -> np.ndarray:
+def observe_state(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
     """Observations of the true state, for the critics of all stages.
 
     They are the paper's 48 numbers, feet, height, past errors, ground and plant. Lengths, times and
@@ -79,12 +77,11 @@ def observe_state(
         env: environments.
         past: their past.
         previous: (n, 12), action of the teacher `SAMPLE_S` ago.
-        command: (n, 4), commands to follow; None for those of the environments.
 
     Returns:
         (n, STATE_SIZE), scaled to about 1.
     """
-    size, command = env.size, env.command if command is None else command
+    size, command = env.size, env.command
     return np.concatenate(
         [
             size.as_reference(command[:, :3]),
@@ -109,22 +106,19 @@ def observe_state(
     ).astype(np.float32)
 
 
-def observe(
-    env: VelocityEnv, past: Past, previous: np.ndarray, command: np.ndarray | None = None
-) -> np.ndarray:
+def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
     """Observations of the teacher: the true state and the clock.
 
     Args:
         env: environments.
         past: their past.
         previous: (n, 12), action of the teacher `SAMPLE_S` ago.
-        command: (n, 4), commands to follow; None for those of the environments.
 
     Returns:
         (n, OBSERVATION_SIZE), scaled to about 1.
     """
     clock = past.clock.observation().astype(np.float32)
-    return np.concatenate([observe_state(env, past, previous, command), clock], axis=1)
+    return np.concatenate([observe_state(env, past, previous), clock], axis=1)
 
 
 def total_action(env: VelocityEnv, past: Past, correction: np.ndarray) -> np.ndarray:

@@ -11,7 +11,6 @@ import torch
 from quadvel_description import symmetry
 
 from . import privileged
-from .command_shift import CommandShift
 from .env import TICK_S, VelocityEnv
 from .past import Past
 from .privileged import ACTION_BOUND
@@ -35,7 +34,7 @@ LABEL_BEFORE, LABEL_AFTER = 3, 1
 
 
 class Teacher:
-    """Teacher of a checkpoint, evaluated at every tick, with averaged actions and shifted commands.
+    """Teacher of a checkpoint, evaluated at every tick, with averaged actions.
 
     Actions are averaged over `AVERAGED_TICKS`, because it learned with actions held for 20 ms.
     Evaluated at every tick without the average, it falls where it does not fall otherwise (decision
@@ -44,21 +43,19 @@ class Teacher:
     Attributes:
         actor: policy of the teacher.
         env: environments.
-        shift: what it follows beyond the commands.
-        past: past of the robots, relative to the shifted commands.
+        past: past of the robots.
         latest: (n, 12), last action before the average, in the network's unit.
     """
 
-    def __init__(self, checkpoint: dict[str, Any], env: VelocityEnv, shift: CommandShift) -> None:
+    def __init__(self, checkpoint: dict[str, Any], env: VelocityEnv) -> None:
         """Load the teacher.
 
         Args:
             checkpoint: content of a checkpoint of `privileged`.
             env: environments.
-            shift: what it follows beyond the commands.
         """
         self.actor = privileged.load_teacher(checkpoint)
-        self.env, self.shift, self.past = env, shift, Past(env)
+        self.env, self.past = env, Past(env)
         n = env.config.n
         self._executed = deque([np.zeros((n, 12), np.float32) for _ in range(HOLD_TICKS)], HOLD_TICKS)
         self._recent = np.zeros((AVERAGED_TICKS, n, 12), np.float32)  # newest first
@@ -82,8 +79,7 @@ class Teacher:
         Returns:
             (n, 12), action in the network's unit.
         """
-        command = self.env.command + self.shift.of(self.env.command)
-        obs = privileged.observe(self.env, self.past, self._executed[0], command)
+        obs = privileged.observe(self.env, self.past, self._executed[0])
         with torch.no_grad():
             correction: np.ndarray = self.actor(torch.from_numpy(obs))[0].numpy()
         self.latest = now = privileged.total_action(self.env, self.past, correction)
@@ -100,7 +96,7 @@ class Teacher:
             command: (n, 4), command that was in force.
             executed: (n, 12), actions taken, in the network's unit.
         """
-        self.past.advance(command + self.shift.of(command))
+        self.past.advance(command)
         self._executed.append(executed.clip(-ACTION_BOUND, ACTION_BOUND))
 
     def past_features(self) -> np.ndarray:
@@ -113,15 +109,6 @@ class Teacher:
         return np.concatenate(
             [3 * past.stride, 12 * past.lasting, 8 * past.lag, past.clock.observation()], axis=1
         ).astype(np.float32)
-
-    def stride_error(self) -> np.ndarray:
-        """Compute the error over a stride, relative to the commands as they are.
-
-        Returns:
-            (n, 3), command minus velocity in vx, vy (m/s) and yaw rate (rad/s).
-        """
-        error: np.ndarray = self.past.stride - self.shift.of(self.env.command)[:, :3]
-        return error
 
 
 def smooth_labels(actions: np.ndarray, mask: np.ndarray) -> np.ndarray:
