@@ -112,6 +112,20 @@ def test_a_joint_that_moves_more_than_it_is_told_to_is_not_in_degrees() -> None:
     )
 
 
+@pytest.mark.parametrize(("factor", "kind"), [(1.0 / SHARE, "refusal"), (1.0, "warning")])
+def test_joints_of_others_turn_far_in_radians_and_not_in_degrees(factor: float, kind: str) -> None:
+    """Turns are far in both: in degrees the joint seems to miss its command by as much."""
+    slow = np.linspace(0.0, 20.0 / factor, 2000)[:, None]
+    values = fields()
+    moved = {"q": values["q"] + slow, "q_des": values["q_des"] + slow, "dq": values["dq"] + slow[1] / 0.002}
+    given = attrs.evolve(
+        log(**{name: factor * value for name, value in moved.items()}),
+        joints=[f"motor_{k}" for k in range(12)],
+    )
+    found = check_log(given)
+    assert any(text.startswith("q: up to ") for text in texts(found, kind)), found.findings
+
+
 def test_clean_log_yields_only_its_rate() -> None:
     checked = check_log(log())
     assert texts(checked, "warning") == []

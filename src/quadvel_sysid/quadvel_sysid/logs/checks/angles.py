@@ -46,6 +46,8 @@ SAME_ANGLE_SHARE = 0.7
 """q and q_des are one angle in two units if they differ by less than this share of their size."""
 MAX_ANGLE_RAD = 10.0
 """rad; no joint of a leg or an arm reaches so far."""
+MAX_MISSED_RAD = 1.0
+"""rms of q_des - q: a joint that turns further than a leg's, and is controlled, stays nearer to its command."""
 UNITS_OF_SPEED = (
     (1.0 / DEGREE_RAD, "q is in degrees where dq is in rad/s, or t is off by 57"),
     (DEGREE_RAD, "dq is in degrees/s where q is in rad"),
@@ -279,9 +281,16 @@ def angle_units(log: Log) -> Iterator[Finding]:
             yield Finding("refusal", field, (), text)
             return
     most = np.percentile(np.where(valid, np.abs(q), 0.0), 95, axis=0)
-    if (joints := log.joints_where(most > MAX_ANGLE_RAD)) and set(log.joints) <= set(JOINT_NAMES):
-        text = f"q: up to {most.max():.0f} on {format_names(joints)}: degrees? expected rad"
-        yield Finding("refusal", "q", joints, text)
-    elif joints:
-        text = f"q: up to {most.max():.0f} on {format_names(joints)}; expected rad"
-        yield Finding("warning", "q", joints, text)
+    # A joint of others may turn several times, but follows its command; in degrees it seems not to.
+    error = np.where(valid, q_des - q, 0.0)
+    missed = np.sqrt((error**2).sum(axis=0) / np.maximum(valid.sum(axis=0), 1))
+    is_ours = set(log.joints) <= set(JOINT_NAMES)
+    far = most > MAX_ANGLE_RAD
+    findings: tuple[tuple[Kind, Bools, str], ...] = (
+        ("refusal", far & (is_ours | (missed > MAX_MISSED_RAD)), ": degrees? expected rad"),
+        ("warning", far, "; expected rad"),
+    )
+    for kind, hit, advice in findings:
+        if joints := log.joints_where(hit):
+            yield Finding(kind, "q", joints, f"q: up to {most.max():.0f} on {format_names(joints)}{advice}")
+            return

@@ -117,8 +117,8 @@ ROW_CHECKS = (
     Check(
         angles.angle_units,
         "size of q_des over that of q; difference of the two, one taken as degrees, over their size; "
-        "size of q, rad",
-        f"25 to 130; {angles.SAME_ANGLE_SHARE:g}; {angles.MAX_ANGLE_RAD:g}",
+        "size of q, rad; of joints with other names also q_des - q, rms, rad",
+        f"25 to 130; {angles.SAME_ANGLE_SHARE:g}; {angles.MAX_ANGLE_RAD:g}; {angles.MAX_MISSED_RAD:g}",
         "refusal",
     ),
     Check(
