@@ -15,7 +15,8 @@ from quadvel_policy.imported.importer import Supplement
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import Diagnosis, diagnose
 from quadvel_why.links import CAUSES
-from quadvel_why.links.drives import SpeedTorqueLimit, TorqueLimit
+from quadvel_why.links.contract import Gains
+from quadvel_why.links.drives import SpeedTorqueLimit, TorqueLimit, WeakDrive
 from quadvel_why.links.ground import Payload
 from quadvel_why.page import page
 from quadvel_why.reading import read_run
@@ -143,6 +144,24 @@ def test_a_robot_that_stood_for_a_moment_has_no_weak_drive(run: Run) -> None:
     noisy = attrs.evolve(standing, tau=standing.tau + rng.normal(0.0, 0.3, standing.q.shape))
     found = examine(noisy).finding
     assert found is None, found.cause.name()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_of_a_standing_robot_is_neither_other_gains_nor_a_weak_drive(run: Run, seed: int) -> None:
+    rng, shape = np.random.default_rng(seed), run.q.shape
+    levelled = run.commands.q[0] + 1e-4 * rng.normal(0.0, 1.0, run.commands.q.shape)
+    held = commands(run, q=levelled, dq=0.0 * run.commands.dq)
+    load = run.tau[0] + 0.02 * np.sin(run.time)[:, None]
+    standing = attrs.evolve(
+        held,
+        q=run.q[0] + rng.normal(0.0, 1e-3, shape),
+        dq=rng.normal(0.0, 0.05, shape),
+        tau=load + rng.normal(0.0, 0.3, shape),
+    )
+    signals = Signals(standing, PolicyFile(ALIENGO))
+    for cause in (Gains(), WeakDrive()):
+        measured = cause.measure(signals)
+        assert measured is None or measured.value < cause.least, measured
 
 
 @pytest.mark.parametrize("no_load", [20.0, 1e9])

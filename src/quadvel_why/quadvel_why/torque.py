@@ -27,6 +27,9 @@ MAX_EXACT_DELAY_S = 0.031
 REGRESSORS = 4
 EQUAL_ERROR = 1.02
 """Ratio to the least error up to which delays count as equally good."""
+MIN_MOVED_RAD = 0.01
+"""Standard deviation of an angle whose noise, at most 1 mrad, does not decide a fit; joints of a standing robot have
+less, hips of a walking one 0.026, its other joints 0.1 or more."""
 LITTLE_TORQUE_NM = 8.0
 """Torque that every healthy drive gives, N m; fits start from rows below it."""
 MIN_SPREAD_NM = 0.05
@@ -59,6 +62,7 @@ class DriveFit:
         errors: Standard errors of the four, (4,).
         share_used: Share of the rows that are no outliers.
         spread: Standard deviation of the residual torque in these rows, N m.
+        has_moved: Whether the joint moved by more than the noise of its angle: else its coefficients say nothing.
     """
 
     command: float
@@ -68,6 +72,7 @@ class DriveFit:
     errors: Array
     share_used: float
     spread: float
+    has_moved: bool
 
 
 class ExactModel:
@@ -239,7 +244,8 @@ class TorqueModel:
         covariance = np.linalg.pinv(x[use].T @ x[use]) * np.mean((y - x @ weights)[use] ** 2)
         command, angle, speed, offset = weights.tolist()
         errors = np.sqrt(np.diag(covariance))
-        return DriveFit(command, angle, speed, offset, errors, float(use.mean()), spread)
+        has_moved = bool(run.q[keep][:, i].std() > MIN_MOVED_RAD)
+        return DriveFit(command, angle, speed, offset, errors, float(use.mean()), spread, has_moved)
 
     @cached_property
     def modelled(self) -> Array:

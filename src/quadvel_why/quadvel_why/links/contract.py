@@ -344,7 +344,9 @@ class Gains(Cause):
         run, trained = signals.run, signals.trained.gains
         if run.temperature is not None and run.temperature.value.max() > HOT_DEG_C:
             return NOTHING  # `temperature` explains weaker gains
-        fits = signals.torque.fits
+        fits = [fit for fit in signals.torque.fits if fit.has_moved]
+        if len(fits) < MIN_AGREEING_JOINTS * len(run.joints) // 12:
+            return None
         kp = np.array([fit.command for fit in fits]) / trained[0]
         kd = np.array([fit.speed for fit in fits]) / trained[1]
         kp_error, kd_error = (float(np.median([fit.errors[k] for fit in fits])) for k in (0, 2))
@@ -361,7 +363,8 @@ class Gains(Cause):
         if not found:
             return NOTHING
         off, name, middle = max(found)
-        worst = int(np.argmax(np.abs(np.log(np.maximum(kp, 1e-3)))))
+        off_by = [abs(math.log(max(fit.command / trained[0], 1e-3))) for fit in signals.torque.fits]
+        worst = int(np.argmax(off_by))
         share = middle * trained[0 if name == "kp" else 1]
         sentence = (
             f"{name}: the drives act with {share:.2f} of the commanded gain, expected {share / middle:.2f}"

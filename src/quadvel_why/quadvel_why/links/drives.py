@@ -73,7 +73,7 @@ class WeakDrive(Cause):
         run = signals.run
         given, error, used = _given_shares(signals)
         middle = float(np.median(given))
-        if middle < CLEAR_COEFFICIENT:
+        if middle < CLEAR_COEFFICIENT or not (used > 0.0).any():
             return None
         # A joint that hardly moves does not determine its share: only what is certain counts.
         lacks = np.where(used > MIN_SHARE_USED, 1.0 - (given + CERTAIN * error) / middle, 0.0)
@@ -86,12 +86,13 @@ class WeakDrive(Cause):
 
 
 def _given_shares(signals: Signals) -> tuple[Array, Array, Array]:
-    """Share of the asked torque that each joint gives, its standard error, and the share of rows that fit, (J,) each."""
+    """Share of the asked torque that each joint gives, its standard error, and the share of rows that fit, (J,) each.
+
+    The last is 0 for a joint that has not moved.
+    """
     if "torque" in signals.parts:
-        fits = signals.torque.fits
-        return tuple(
-            np.array(x) for x in zip(*((f.command, f.errors[0], f.share_used) for f in fits), strict=True)
-        )  # type: ignore[return-value]
+        each = [(f.command, f.errors[0], f.share_used * f.has_moved) for f in signals.torque.fits]
+        return tuple(np.array(x) for x in zip(*each, strict=True))  # type: ignore[return-value]
     # A robot that stopped at once: tau = share asked, with the commanded gains.
     run, exact = signals.run, signals.torque.exact
     assert run.tau is not None
