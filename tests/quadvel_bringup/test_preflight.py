@@ -113,7 +113,11 @@ def test_a_wrong_name_or_file_is_refused_before_anything_starts(
             "sim_node:\n  ros__parameters: {payloat: 1.0}",
             r"sim_node: found the parameter payloat, did you mean payload\?$",
         ),
-        ("sim_node:\n  ros__parameters: {payload: 1}", "sim_node: payload is 1, expected a float"),
+        ("sim_node:\n  ros__parameters: {payload: 1}", "sim_node: payload is 1, expected a float: write 1.0"),
+        (
+            "/**:\n  ros__parameters: {max_tilt: 0.9}",
+            r"p\.yaml: found max_tilt in the section /\*\*, but .* expected it in the section controller$",
+        ),
         ("sim_node:\n  ros__parameters: {payload: 99.0}", "sim_node: .*payload.*99"),
         (
             "simnode:\n  ros__parameters: {payload: 1.0}",

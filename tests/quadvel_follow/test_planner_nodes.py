@@ -158,5 +158,21 @@ def test_in_closed_loop_a_way_begins_with_the_first_odometry(begin: Callable[...
     peer = begin(TrajectoryPlanner, "-p", "file:=eight", "-p", "closed_loop:=true")
     until = time.monotonic() + 0.5
     peer.wait(lambda: time.monotonic() > until)
-    assert peer.heard["cmd_vel"] == []
+    assert set(peer.speeds("cmd_vel")) <= {0.0}
     peer.wait(lambda: max(peer.speeds("cmd_vel"), default=0.0) > 0.1, peer.send_odometry)
+
+
+def test_a_way_begins_once_the_robot_walks(begin: Callable[..., Peer]) -> None:
+    peer = begin(TrajectoryPlanner, "-p", "file:=eight")
+    controller = peer.node.create_publisher(ControllerState, "controller/state", 1)
+    refusal = "the robot is in mode passive"
+
+    def send() -> None:
+        controller.publish(ControllerState(walk_refusal=refusal))
+
+    peer.wait(lambda: peer.tested._refusal, send)
+    heard = len(peer.heard["cmd_vel"])
+    peer.wait(lambda: len(peer.heard["cmd_vel"]) > heard + 20, send)
+    assert set(peer.speeds("cmd_vel")[heard + 5 :]) == {0.0}
+    refusal = ""
+    peer.wait(lambda: max(peer.speeds("cmd_vel")) > 0.1, send)

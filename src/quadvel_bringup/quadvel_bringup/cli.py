@@ -571,8 +571,8 @@ def record(
     """Record topics to an MCAP file for Foxglove and ros2 bag.
 
     With --ring the latest messages stay in memory, and each fault of the robot is written to its
-    own file. Exit code 1 and no file if no message arrived. If the recorder is killed, all but the
-    last second is readable.
+    own file. Exit code 1 if a given topic brought no message; without any message there is no file.
+    If the recorder is killed, all but the last second is readable.
 
     \b
     For example:
@@ -586,7 +586,7 @@ def record(
     if ring is not None:
         heard = record_faults(out or Path("out/faults"), topics or [], ring, seconds)
     else:
-        heard = bool(run_record(out or Path("out/record.mcap"), topics or [], seconds))
+        heard = run_record(out or Path("out/record.mcap"), topics or [], seconds)
     if not heard:
         raise typer.Exit(1)
 

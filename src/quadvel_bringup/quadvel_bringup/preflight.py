@@ -192,6 +192,13 @@ def _check_names(overrides: Iterable[ParameterOverride], nodes: Mapping[str, str
             place = meant.pop() if len(meant) == 1 else override.pattern
             listed = _parameter_names().get(place, list(dict.fromkeys(known)))
             raise ValueError(f"{place}: found the parameter {override.name}, {_hint(override.name, listed)}")
+        owners = [node for node in NODES if override.name in _parameter_names()[node]]
+        others = sorted(meant - {*owners})
+        if others and not running and not _is_of_rclpy(override.name):
+            raise ValueError(
+                f"found {override.name} in the section {override.pattern}, but {others[0]} has no such parameter: "
+                f"expected it in the section {' or '.join(owners)}"
+            )
 
 
 @cache
@@ -211,6 +218,13 @@ def _hint(found: str, known: Iterable[str]) -> str:
     """Return the nearest name, or all names if none is near."""
     near = get_close_matches(found, [*known], 1)
     return f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
+
+
+def _expected(wanted: type[Any], value: Any) -> str:
+    """Name a type, and for a whole number the spelling with which ROS 2 reads a float."""
+    if wanted is float and type(value) is int:
+        return f"a float: write {value}.0"
+    return "a list" if wanted is tuple else f"a {wanted.__name__}"
 
 
 def _check(name: str, part: NodeCheck, values: Mapping[str, Any]) -> Any:
@@ -235,8 +249,7 @@ def _record(name: str, part: NodeCheck, values: Mapping[str, Any]) -> Any:
             raise ValueError(f"{name}: found the parameter {parameter}, {_hint(parameter, defaults)}")
         wanted = type(defaults[parameter])
         if wanted is not (tuple if isinstance(value, list) else type(value)):
-            expected = "list" if wanted is tuple else wanted.__name__
-            raise ValueError(f"{name}: {parameter} is {value!r}, expected a {expected}")
+            raise ValueError(f"{name}: {parameter} is {value!r}, expected {_expected(wanted, value)}")
     given = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items() if key in defaults}
     try:
         return make_record(kind, given)

@@ -25,7 +25,7 @@ AFTER_FAULT_S = 3.0
 """Time that a recording of a fault continues after it."""
 
 
-def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
+def record(path: Path, topics: Sequence[str], seconds: float | None) -> bool:
     """Record topics, and the robot's description, until Ctrl-C or for a duration.
 
     Without any message no file is written.
@@ -37,7 +37,7 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
             topic, if none is given), at the latest after session.DISCOVERY_TIMEOUT_S.
 
     Returns:
-        Number of recorded messages.
+        Whether there is a message on every given topic, or on any if none is given.
 
     Raises:
         ValueError: The suffix of the file is not .mcap.
@@ -57,11 +57,12 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
         console.print(
             f"no message on {sought} on ROS domain {ros_domain()}; {path} was not written; {advice}"
         )
-        return 0
-    for topic in sorted(set(wanted) - counts.keys()):
-        console.print("; ".join(filter(None, [f"no message on {topic}", _spelling([topic], present)])))
+        return False
+    silent = sorted(set(wanted) - counts.keys())
+    for topic in silent:
+        console.print(_silence(topic, present))
     console.print(f"{path}: {_summary(counts)}")
-    return counts.total()
+    return not silent
 
 
 def _record_until(
@@ -73,7 +74,8 @@ def _record_until(
     from .recording_file import RecordingFile
     from .session import DISCOVERY_TIMEOUT_S, Session
 
-    discovered_by, ends = time.monotonic() + DISCOVERY_TIMEOUT_S, float("inf")
+    discovered_by = time.monotonic() + DISCOVERY_TIMEOUT_S
+    has_begun, ends, present = False, float("inf"), list[str]()
     with (
         StopSignals() as signals,
         console.status("recording; Ctrl-C stops") as status,
@@ -85,10 +87,14 @@ def _record_until(
                 recorder.record_all(_with_description(wanted))
                 recorder.serve(session.executor, min(DISCOVERY_PERIOD_S, left))
                 status.update(f"{_summary(recorder.counts)}; Ctrl-C stops")
-                is_heard = recorder.counts.keys() >= set(wanted) if wanted else recorder.counts
-                if ends == float("inf") and (is_heard or time.monotonic() > discovered_by):
-                    ends = _end(seconds)
-            return recorder.counts, [topic for topic, _ in session.node.get_topic_names_and_types()]
+                silent = set(wanted) - recorder.counts.keys()
+                is_heard = recorder.counts and not silent
+                present = [topic for topic, _ in session.node.get_topic_names_and_types()]
+                if not has_begun and (is_heard or time.monotonic() > discovered_by):
+                    has_begun, ends = True, _end(seconds)
+                    for topic in sorted(silent) if recorder.counts else ():
+                        console.print(f"{_silence(topic, present)}; the recording goes on")
+            return recorder.counts, present
         except OSError as error:
             written = f"after {_summary(recorder.counts)}; about the last second of them is unreadable"
             raise OSError(f"{path}: the recording ended {written}: {error.strerror}") from error
@@ -216,6 +222,11 @@ def _spelling(topics: Sequence[str], present: Sequence[str]) -> str:
     unknown = [topic for topic in topics if topic not in present]
     near = [name for topic in unknown for name in get_close_matches(topic, present, 1)]
     return f"did you mean {', '.join(near)}?" if near else ""
+
+
+def _silence(topic: str, present: Sequence[str]) -> str:
+    """Say that a topic has brought nothing, and what it may be called."""
+    return "; ".join(filter(None, [f"no message on {topic}", _spelling([topic], present)]))
 
 
 def _with_description(topics: Sequence[str]) -> list[str]:

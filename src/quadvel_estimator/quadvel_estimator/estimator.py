@@ -35,6 +35,7 @@ from quadvel_nodes.node import create_only_publisher, read_parameters, run
 from quadvel_nodes.robot_check import RobotCheck
 from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transform_messages
 from quadvel_nodes.scheduling import Scheduling
+from quadvel_nodes.silence import SilenceWarning
 from quadvel_nodes.stall_free_clock import StallFreeClock
 
 from . import features
@@ -104,6 +105,9 @@ class EstimatorNode(Node):
         self._robot_time = StallFreeClock()
         self._refusals = Refusals()
         self._reported = _ReportedCounts()
+        self._silence = SilenceWarning(
+            self.get_logger().warning, "low_state", "is a simulator or a driver running?"
+        )
         self._count = 0
         self._busy_s = 0.0  # computing time of all estimates
         self._velocity = create_only_publisher(self, TwistWithCovarianceStamped, "velocity_estimate", 10)
@@ -183,6 +187,7 @@ class EstimatorNode(Node):
         """Publish /diagnostics about the last second."""
         count, busy = self._count - self._reported.count, self._busy_s - self._reported.busy
         self._reported, refused = _ReportedCounts(self._count, self._busy_s), self._refusals.last_second()
+        self._silence.report(self._count > 0, refused)
         if count == 0:
             level, summary = DiagnosticStatus.WARN, "no valid low_state in the last second"
         elif refused:

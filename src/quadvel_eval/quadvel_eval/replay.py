@@ -190,11 +190,15 @@ def _resample_to_milliseconds(
     max_period: float,
 ) -> JointRecord:
     """Interpolate states (n, 12) at `ticks` (n,) ms to one row per ms, and attach the commands."""
-    period = np.median(np.diff(ticks)) * 1e-3 if len(ticks) > 1 else np.nan
-    if not period <= max_period or not commands:
+    if len(ticks) < 2 or not commands:
+        missing = "low_cmd" if len(ticks) > 1 else "low_state"
         raise ValueError(
-            f"{path}: low_state: found a period of {period:g} s and {len(commands)} commands, expected {max_period:g} s"
-            " at most, and commands"
+            f"{path}: {missing}: found no message, expected a recording of low_state and low_cmd"
+        )
+    period = np.median(np.diff(ticks)) * 1e-3
+    if not period <= max_period:
+        raise ValueError(
+            f"{path}: low_state: found a period of {period:g} s, expected {max_period:g} s at most"
         )
     every = np.arange(ticks[0], ticks[-1] + 1)
     q, dq, tau = (interp1d(ticks, each, axis=0)(every) for each in values)

@@ -25,6 +25,7 @@ from quadvel_msgs.srv import SelectPerson
 from quadvel_nodes.diagnostics import LOG_THROTTLE_S, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, seconds
 from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.silence import SilenceWarning
 
 from .leg_detector import SHIPPED_MODEL, LegDetector
 from .person_tracker import PersonTracker, Track
@@ -91,6 +92,10 @@ class PersonTrackerNode(Node):
         self._pose = np.zeros(3)
         self._refusals = Refusals()
         self._scan_count = self._scan_count_before = 0
+        warn = self.get_logger().warning
+        self._no_scan = SilenceWarning(warn, "scan", "is a laser or `quadvel up --world` running?")
+        self._no_odom = SilenceWarning(warn, "odom", "without odometry set use_odom to false")
+        self._has_odom = not self._settings.use_odom
         self._person_message = self.create_publisher(PoseStamped, "person", 10)
         self._odometry = self.create_publisher(Odometry, "person/odometry", 10)
         self._persons = self.create_publisher(Persons, "persons", 10)
@@ -108,6 +113,7 @@ class PersonTrackerNode(Node):
         except ValueError as error:
             self._refusals.add("odom", MessageError(str(error)))
             return
+        self._has_odom = True
         self._frame = message.header.frame_id
         while self._waiting and seconds(self._waiting[0].header.stamp) <= self._poses.newest:
             self._track_scan(self._waiting.popleft())
@@ -201,6 +207,8 @@ class PersonTrackerNode(Node):
         """Publish the diagnostics of the last second."""
         used, self._scan_count_before = self._scan_count - self._scan_count_before, self._scan_count
         refused = self._refusals.last_second()
+        self._no_scan.report(bool(self._scan_count or self._waiting), refused)
+        self._no_odom.report(self._has_odom, refused)
         if refused:
             level, summary = DiagnosticStatus.WARN, refused
             self.get_logger().warning(summary, throttle_duration_sec=LOG_THROTTLE_S)

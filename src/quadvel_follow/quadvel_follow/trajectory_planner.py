@@ -16,6 +16,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 
 from quadvel_description.fields import field, positive
+from quadvel_msgs.msg import ControllerState
 from quadvel_nodes.messages import MessageError, Refusals
 from quadvel_nodes.node import read_parameters, request_exit, run
 
@@ -24,6 +25,9 @@ from .trajectory import SHIPPED_FOLDER, STEP_S, Trajectory, TrajectoryFollower, 
 
 ODOM_TIMEOUT_S = 0.2
 """Silence of the odometry after which a closed-loop trajectory ends."""
+
+SILENCE_S = 2.0
+"""Time for other nodes to be found, before the node says what it waits for."""
 
 
 @attrs.frozen
@@ -47,7 +51,11 @@ class TrajectoryParameters:
 
 
 class TrajectoryPlanner(Node):
-    """ROS node that executes a trajectory; in closed loop it starts with the first odometry."""
+    """ROS node that executes a trajectory.
+
+    It starts once somebody listens to its velocities, the robot would follow them, and, in closed loop,
+    odometry arrives. Until then it commands zero and says what it waits for.
+    """
 
     def __init__(self) -> None:
         super().__init__("trajectory_planner")
@@ -59,9 +67,12 @@ class TrajectoryPlanner(Node):
         self._pose: np.ndarray | None = None
         self._odom_received_at = -np.inf  # s
         self._started_at: float | None = None
+        self._refusal = self._said = ""  # why the robot would not walk; what was said last
+        self._since: float | None = None  # s, when the node began to wait
         self._refusals = Refusals()
         self._publisher = self.create_publisher(Twist, "cmd_vel", 10)
         self.create_subscription(Odometry, "odom", self._on_odom, qos_profile_sensor_data)
+        self.create_subscription(ControllerState, "controller/state", self._on_robot, 1)
         self.create_timer(STEP_S, self._step)
 
     def _now(self) -> float:
@@ -74,15 +85,33 @@ class TrajectoryPlanner(Node):
         else:
             self._refusals.add("odom", MessageError(f"pose is {pose.tolist()}, expected finite numbers"))
 
+    def _on_robot(self, message: Any) -> None:
+        self._refusal = message.walk_refusal
+
+    def _missing(self, now: float) -> str:
+        """What the start waits for; "" if nothing is missing."""
+        if not self._publisher.get_subscription_count():
+            return "a subscriber of cmd_vel; start the robot: quadvel up"
+        if self._refusal:
+            return f"the robot, which does not walk: {self._refusal}"
+        return "odometry on odom" if self._is_blind(now) else ""
+
+    def _is_blind(self, now: float) -> bool:
+        return self._closed_loop and now - self._odom_received_at > ODOM_TIMEOUT_S
+
     def _step(self) -> None:
         now = self._now()
-        if self._closed_loop and now - self._odom_received_at > ODOM_TIMEOUT_S:
-            if self._started_at is not None:
-                request_exit(self, f"trajectory_planner: odom is silent for more than {ODOM_TIMEOUT_S} s")
-            return
         if self._started_at is None:
+            missing = self._missing(now)
+            if missing:
+                self._say(f"waits for {missing}", now)
+                self._publisher.publish(Twist())  # a robot follows velocities after a zero one
+                return
             self._started_at = now
             self.get_logger().info("starts")
+        if self._is_blind(now):
+            request_exit(self, f"trajectory_planner: odom is silent for more than {ODOM_TIMEOUT_S} s")
+            return
         try:
             velocity = self._follower.step(now - self._started_at, self._pose)
         except ValueError as error:
@@ -95,6 +124,14 @@ class TrajectoryPlanner(Node):
         else:
             twist.linear.x, twist.linear.y, twist.angular.z = velocity.tolist()
         self._publisher.publish(twist)
+
+    def _say(self, sentence: str, now: float) -> None:
+        """Log what the node waits for, once, if it still does after SILENCE_S."""
+        if self._since is None:
+            self._since = now
+        if now - self._since > SILENCE_S and sentence != self._said:
+            self._said = sentence
+            self.get_logger().info(sentence)
 
 
 def main(args: list[str] | None = None) -> None:

@@ -98,6 +98,7 @@ class CommandMuxNode(Node):
         simulated = self.get_parameter("use_sim_time").value
         self.create_timer(PERIOD_S, self._update, clock=self.get_clock() if simulated else steady)
         self.create_timer(1.0, self._report, clock=steady)
+        self.get_logger().info(f"takes velocities from {', '.join(settings.topics)}")
 
     def _now(self) -> float:
         return float(1e-9 * self.get_clock().now().nanoseconds)

@@ -32,6 +32,7 @@ from quadvel_nodes.node import create_only_publisher, read_parameters, run
 from quadvel_nodes.number_text import counted, number_text
 from quadvel_nodes.robot_check import RobotCheck
 from quadvel_nodes.scheduling import Scheduling
+from quadvel_nodes.silence import SILENCE_LIMIT_S, SilenceWarning
 
 from .control_loop import WATCH_PERIOD_S, ControlConfig, ControlLoop
 from .loop_stats import LoopSummary
@@ -44,10 +45,6 @@ from .transitions import MODES
 
 # Only the newest state is useful.
 LATEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
-SILENCE_LIMIT_S = 5
-"""s without any state after which the log states that the controller waits for one. In lockstep,
-where time stands still then, a robot that reported before counts as lost.
-"""
 
 
 @attrs.frozen(kw_only=True)
@@ -87,7 +84,10 @@ class Controller(Node):
         self._overruns_before = self._pauses_before = 0
         self._operator_log = OperatorLog(self._supervisor)
         self._loop_summary = LoopSummary()  # of the last second
-        self._reports = self._silent_reports = 0  # total, and since the last low_state
+        self._silent_reports = 0  # since the last low_state
+        self._silence = SilenceWarning(
+            self.get_logger().warning, "low_state", "is a simulator or a driver running?"
+        )
         self._create_interfaces()
         if not self._sim_time:  # simulated time waits for the node, so it needs no priority
             self._settings.scheduling.apply(self.get_logger().warning)
@@ -212,6 +212,7 @@ class Controller(Node):
         self._loop.inputs.duplicate_publisher = self._duplicate_publisher()
         self._loop_summary = self._loop.stats.summary(time.perf_counter())
         self._silent_reports += 1
+        # In lockstep, where time stands still then, a robot that reported before counts as lost.
         if self._sim_time and self._loop.inputs.state is not None and self._silent_reports > SILENCE_LIMIT_S:
             self._supervisor.fail(
                 f"no state came for {SILENCE_LIMIT_S} s: the simulator is silent", "state_stale"
@@ -235,16 +236,12 @@ class Controller(Node):
     def _log_status(self, level: bytes, summary: str) -> None:
         """Log what keeps the robot from moving, and warnings, at 1 Hz or less."""
         log = self.get_logger()
-        self._reports += 1
         for sentence in self._operator_log.walk_refusals():
             log.info(sentence)
         if self._loop.inputs.duplicate_publisher:
             log.error(self._loop.inputs.duplicate_publisher, throttle_duration_sec=LOG_THROTTLE_S)
         elif self._loop.inputs.state is None:
-            if self._reports == SILENCE_LIMIT_S:
-                log.warning(
-                    f"{self._missing_state_text()} in {SILENCE_LIMIT_S} s: is a simulator or a driver running?"
-                )
+            self._silence.report(False, str(self._loop.inputs.refused.get("low_state", "")))
         elif level == DiagnosticStatus.WARN:
             log.warning(summary, throttle_duration_sec=LOG_THROTTLE_S)
 
