@@ -44,7 +44,32 @@ Further arguments are those of ROS 2:
 
 
 class _PanelGroup(TyperGroup):
-    """Prints the help on one screen of 80 x 40: examples, then the commands in panels."""
+    """Prints the help on one screen of 80 x 40: examples, then the commands in panels.
+
+    Errors of values name the value.
+    """
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command.
+
+        Args:
+            ctx: The context of the command line.
+
+        Returns:
+            What the command returns.
+
+        Raises:
+            typer.BadParameter: An option has a wrong value.
+        """
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            for one in getattr(error.__cause__, "errors", list[Any])()[
+                :1
+            ]:  # of pydantic, by which typer checks
+                if (found := one["input"]) is not None and repr(found) not in error.message:
+                    error.message = f"found {found!r}: {error.message}"
+            raise
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help.
@@ -609,7 +634,9 @@ def _register(name: str, delegated: DelegatedCommand, groups: dict[str, typer.Ty
         rich_help_panel=delegated.panel,
     )
     def hand_on(context: typer.Context) -> None:
-        command(name).main(context.args, prog_name=context.command_path)
+        code = command(name).main(context.args, prog_name=context.command_path, standalone_mode=False)
+        if isinstance(code, int):
+            raise typer.Exit(code)
 
 
 _groups = {"": app}

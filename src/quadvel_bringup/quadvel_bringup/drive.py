@@ -19,6 +19,7 @@ from rclpy.exceptions import NameValidationException
 from quadvel_description.arrays import Array
 from quadvel_msgs.msg import ControllerState, VelocityCommand
 from quadvel_nodes.number_text import number_text
+from quadvel_nodes.topic_types import all_conflicts
 
 from .operator_commands import MODE_TIMEOUT_S, NO_STATES, RECOVERY_HINT, START_HINT
 from .processes import StopSignals
@@ -86,8 +87,11 @@ class DriveRun:
         return self.refusal()
 
     def _no_subscriber(self) -> NotRunningError:
-        """Return an error that names the topics on which somebody takes velocities, if there are any."""
+        """Return an error that names another type, or the topics on which somebody takes velocities, if there are any."""
         node, text = self._session.node, f"{self._topic}: no subscriber"
+        for conflict in all_conflicts(node):
+            if conflict.topic == node.resolve_topic_name(self._topic):
+                return NotRunningError(str(conflict))
         taken = [
             topic
             for topic, types in node.get_topic_names_and_types()
