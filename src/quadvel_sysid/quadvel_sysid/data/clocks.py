@@ -287,6 +287,8 @@ def _is_better(before: _Errors, after: _Errors) -> bool:
     both = before.rows & after.rows
     gain = np.add.reduceat(np.sum(before.squares - after.squares, axis=1, where=both), after.starts)
     used = np.logical_or.reduceat(both.any(axis=1), after.starts)
+    if used.sum() < 2:
+        return False
     test = stats.ttest_1samp(gain[used], 0.0, alternative="greater")
     return bool(test.pvalue < _SIGNIFICANCE_LEVEL)
 

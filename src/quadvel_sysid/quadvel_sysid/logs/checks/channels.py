@@ -29,6 +29,11 @@ MOVING_SPEED_RAD_S = 0.05
 """rad/s; a joint moves from this speed on."""
 MOVING_SPAN_RAD = 1e-3
 """rad; a joint whose q spans less is motionless."""
+RESTING_RAD, RESTING_RATIO = 0.01, 1.3
+"""Standard deviation of q, and its ratio to that of white noise with the same second differences, below
+which a joint rests but for the noise of its encoder. Of noise the ratio is 1, of motion that a log can show
+it is larger: 2 at a sixth of the rate of the rows.
+"""
 REPEATED_ROWS_SHARE = 0.5
 """If more than this share of the rows in motion repeats the row before, the logger is faster than
 the state.
@@ -78,7 +83,7 @@ def slope_at_rows(log: Log, values: Floats, row: Indices) -> Floats:
 
 
 def motionless(log: Log) -> Iterator[Finding]:
-    """Joints that never move.
+    """Joints that never move, but for the noise of their encoders.
 
     Args:
         log: The log to check.
@@ -86,9 +91,14 @@ def motionless(log: Log) -> Iterator[Finding]:
     Yields:
         A refusal if no joint moves, a warning if some joints do not.
     """
-    still = log.joints_where(np.ptp(log.q, axis=0) < MOVING_SPAN_RAD)
+    span, spread = np.ptp(log.q, axis=0), np.std(log.q, axis=0)
+    # White noise of variance s^2 has second differences of variance 6 s^2.
+    noise = np.std(np.diff(log.q, n=2, axis=0), axis=0) / np.sqrt(6.0)
+    rests = (spread < RESTING_RAD) & (spread < RESTING_RATIO * noise)
+    still = log.joints_where((span < MOVING_SPAN_RAD) | rests)
     if len(still) == len(log.joints):
-        yield Finding("refusal", "q", still, "q: no joint ever moves, so nothing can be identified")
+        text = f"q: no joint moves by more than {1e3 * spread.max():.1f} mrad (rms), so nothing can be identified"
+        yield Finding("refusal", "q", still, f"{text}: record a motion, as `quadvel excite` does")
     elif still:
         text = f"q: never moves: {format_names(still)}; only their torque at rest is observed"
         yield Finding("warning", "q", still, text)

@@ -58,8 +58,9 @@ ROW_CHECKS = (
     Check(masked_rows, "rows of `valid` that are false", "any", "note; left out"),
     Check(
         channels.motionless,
-        "span of q, rad",
-        f"{channels.MOVING_SPAN_RAD:g}",
+        "span of q, rad; or its standard deviation, rad, and the ratio of this to the noise that its second "
+        "differences suggest",
+        f"{channels.MOVING_SPAN_RAD:g}; {channels.RESTING_RAD:g}, {channels.RESTING_RATIO:g}",
         "warning; on all joints a refusal",
     ),
     Check(
