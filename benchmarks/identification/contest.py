@@ -69,7 +69,12 @@ def publish(size: str, seed: int, folder: Path, logs_of_each_kind: int = 1) -> l
 
     Returns:
         Files of the logs.
+
+    Raises:
+        FileExistsError: The folder holds a contest already, whose truth and answers belong together.
     """
+    if (folder / "truth").exists():
+        raise FileExistsError(f"{folder}: holds a contest already; name another folder, or remove this one")
     cases = [
         (generator, kind, index)
         for generator, kinds in KINDS[size].items()

@@ -257,7 +257,8 @@ def _print_proposals(report: Path, console: Console) -> None:
     try:
         proposals = propose(read_json(report))
     except (KeyError, TypeError) as error:
-        raise ValueError(f"{report}: not a report of `quadvel identify`: {error!r}") from None
+        missing = f"the field {error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{report}: {missing}; expected the report.json of `quadvel identify`") from None
     if not proposals:
         console.print("The report has no ambiguity that another motion would resolve.")
     for one in proposals:

@@ -58,7 +58,13 @@ class _SeveralValues(TyperCommand):
 
     @override
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        return super().parse_args(ctx, list(_repeat_options(args)))
+        try:
+            return super().parse_args(ctx, list(_repeat_options(args)))
+        except typer.BadParameter as error:
+            greedy = [option for option in MULTI_VALUE_OPTIONS if option in args]
+            if greedy and error.param is not None and error.param.name == "logs":
+                error.message = f"Name them before {greedy[0]}, which takes all values that follow it."
+            raise
 
 
 def _repeat_options(arguments: Iterable[str]) -> Iterable[str]:

@@ -34,7 +34,8 @@ MAX_LEARNED_FRACTION = 1.0 / 3.0
 _GAIN_CAUSES = {
     "kp": "q or q_des of another joint, unit or sign; a command column that holds the next state; "
     "commanded gains of another unit",
-    "kd": "joints that hardly move; dq that is dead for a while, or of another unit, sign or joint; commanded gains of another unit",
+    "kd": "joints that hardly move; dq that is dead for a while, or of another unit, sign or joint; "
+    "commanded gains of another unit",
 }
 _DELAY_CAUSE = "states and commands of different clocks; a command column that holds the state"
 _LEARNED_CAUSE = "a controller that is no PD law; a signal of another joint, unit or sign; a dead signal"
