@@ -25,6 +25,8 @@ from .operator_commands import MODE_TIMEOUT_S, NO_STATES, RECOVERY_HINT, START_H
 from .processes import StopSignals
 from .session import DISCOVERY_TIMEOUT_S, NotRunningError, Session, not_running
 
+TOO_SLOW = "the command mux takes a velocity within its dead_zone for zero"
+
 PUBLISH_PERIOD_S = 0.05
 """Time between two messages; the command mux drops a source after 0.5 s."""
 SETTLING_TIME_S = 0.5
@@ -157,7 +159,8 @@ class DriveRun:
             why = "clipped to the limits of mux and policy" if self._full_effect else ramping
             print(f"in effect  {velocity_text(self._in_effect)}, {why}")
         if source:
-            print(f"not followed: {source} commands the robot")
+            is_own = source.strip("'") in self._topic
+            print("not followed: " + (TOO_SLOW if is_own else f"{source} commands the robot"))
             return 1
         if self._full_effect and self._estimates:
             velocity = _mean(self._estimates)

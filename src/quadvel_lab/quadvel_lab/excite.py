@@ -163,7 +163,10 @@ def excite_command(
         str | None, typer.Argument(help=f"One of {', '.join(EXCITATIONS)}.", show_default=False)
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0.5, help="Duration, s.", show_default="by the motion")
+        float | None,
+        typer.Option(
+            min=0.5, help=f"Duration, s, after a ramp of {RAMP_S:g} s.", show_default="by the motion"
+        ),
     ] = None,
     out: Annotated[
         Path | None,
