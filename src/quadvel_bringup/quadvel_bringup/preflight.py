@@ -167,6 +167,7 @@ def _check_values_of_file(file: Path, names: Iterable[str]) -> None:
     """Check types and ranges of the values that a parameter file gives to nodes."""
     found = parse(["--ros-args", "--params-file", str(file)])
     for name in names:
+        installed_node(name)
         try:
             _record(name, NODE_CHECKS[name], found.parameters_for(f"/{name}"))
         except ValueError as error:
