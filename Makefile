@@ -43,7 +43,7 @@ test: $(VENV)/.test  ## install the test dependencies (torch too) and run the te
 	$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 tutorials: $(VENV)/.test  ## run every cell of the site's pages
-	$(PY) -m pytest -m tutorial tests/end_to_end/test_tutorials.py
+	$(PY) -m pytest -n 2 -m tutorial tests/end_to_end/test_tutorials.py
 
 ros-tests: $(ROS_VENV)/.test
 
