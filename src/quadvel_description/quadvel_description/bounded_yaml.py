@@ -91,6 +91,10 @@ def load_yaml(text: str, loader: type[BoundedLoader] = BoundedLoader) -> Any:
         raise ValueError(f"found more than {MAX_CHARACTERS} characters, expected fewer")
     try:
         return loader(text).get_single_data()
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = f" in line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        raise ValueError(f"{error.problem or error.context}{place}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(" ".join(str(error).split())) from None
 

@@ -43,6 +43,10 @@ class UnsupportedRobotError(ValueError):
         self.code = code
 
 
+SUFFIXES = (".xml", ".urdf", ".mjcf")
+"""Suffixes of files that may describe a robot."""
+
+
 @attrs.frozen(eq=False, kw_only=True)
 class FoundJoint:
     """A joint of the file. A number that the file does not state is NaN.
@@ -131,6 +135,10 @@ def find_robot(path: Path) -> FoundRobot:
         raise IsADirectoryError(f"{path}: found a folder, expected an MJCF or URDF file")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: found no such file, expected an MJCF or URDF")
+    if path.suffix.lower() not in SUFFIXES:
+        raise UnsupportedRobotError(
+            path, "suffix", f"found '{path.suffix}', expected {' or '.join(SUFFIXES)}"
+        )
     return _Finder(path, _compile(path)).find()
 
 
