@@ -16,8 +16,8 @@ from quadvel_policy.policy_file import PolicyFile
 from quadvel_why.diagnosis import Diagnosis, diagnose
 from quadvel_why.links import CAUSES
 from quadvel_why.links.contract import Gains
-from quadvel_why.links.drives import SpeedTorqueLimit, TorqueLimit, WeakDrive
-from quadvel_why.links.ground import Payload
+from quadvel_why.links.drives import JammedJoint, SpeedTorqueLimit, TorqueLimit, WeakDrive
+from quadvel_why.links.ground import Payload, RoughGround, Slipping, SteepGround
 from quadvel_why.page import page
 from quadvel_why.reading import read_run
 from quadvel_why.report import summary
@@ -315,3 +315,14 @@ def test_causes_that_are_not_examined_for_one_reason_share_a_line(run: Run) -> N
     lines = summary(joints_only, diagnosis).splitlines()
     assert len(lines) == 2 + len(set(diagnosis.skipped.values()))
     assert all(any(name in line for line in lines) for name in diagnosis.skipped)
+
+
+def test_of_a_robot_that_hangs_nothing_about_feet_and_ground_is_examined(run: Run) -> None:
+    assert run.tau is not None
+    light = attrs.evolve(run, tau=0.1 * run.tau)
+    signals = Signals(light, PolicyFile(ALIENGO))
+    assert signals.legs.hangs
+    assert not Signals(run, PolicyFile(ALIENGO)).legs.hangs
+    assert [
+        cause for cause in (JammedJoint(), SteepGround(), RoughGround(), Slipping()) if cause.measure(signals)
+    ] == []

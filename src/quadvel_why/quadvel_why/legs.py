@@ -17,10 +17,12 @@ import numpy as np
 
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.kinematics import foot_kinematics, rotation_matrix
+from quadvel_description.quadruped import GRAVITY
 from quadvel_description.state import RobotState
 from quadvel_estimator.odometry import leg_velocity
 
 from .run import Run
+from .torque import robust_std
 
 PLANTED_N = 40.0
 """Force on the ground, N, above which a foot counts as planted."""
@@ -32,6 +34,8 @@ DAMPING_M2 = 1e-4
 """Damping (m^2) of the least squares for the foot forces; it bounds them near a straight leg."""
 WALKED_SLOPE_RAD = 0.29
 """Steepest ground on which the shipped policy was shown to walk, 15 degrees, and a margin for its measurement."""
+HELD_SHARE = 0.5
+"""A robot whose feet carry less than this share of its weight hangs, or is held."""
 PAIRS = tuple(combinations(range(4), 2))
 
 
@@ -53,8 +57,8 @@ class GroundPlane:
 
     @property
     def spread(self) -> float:
-        """Robust standard deviation of the heights about the slope, m."""
-        return float(1.4826 * np.median(np.abs(self.heights - self.on_slope)))
+        """Robust standard deviation of the heights about the slope, m; NaN without a pair."""
+        return robust_std(self.heights - self.on_slope)
 
     @property
     def angle(self) -> float:
@@ -99,6 +103,12 @@ class Legs:
         # Damped least squares of J^T f = -tau: f = -(J J^T + lambda)^-1 J tau.
         damped = self._jacobians @ transposed + DAMPING_M2 * np.eye(3)
         return self._to_world(-np.linalg.solve(damped, self._jacobians @ torque)[..., 0])
+
+    @cached_property
+    def hangs(self) -> bool:
+        """Whether the robot hangs: its feet say nothing about the ground."""
+        total = self.force[..., 2].sum(axis=1)[self.usable]
+        return bool(len(total) and total.mean() < HELD_SHARE * GRAVITY * self.run.robot.mass)
 
     @cached_property
     def planted(self) -> Bools:
@@ -151,7 +161,7 @@ class Legs:
         """Robust standard deviation of the height between two planted feet, m."""
         found = [(self.height[:, i] - self.height[:, j])[rows] for i, j, rows in self.pair_rows()]
         values = np.concatenate(found)
-        return float(1.4826 * np.median(np.abs(values))) if len(values) else float("inf")
+        return robust_std(values) if len(values) else float("inf")
 
     @cached_property
     def plane(self) -> GroundPlane:

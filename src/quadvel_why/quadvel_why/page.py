@@ -44,10 +44,10 @@ A recording of this stack holds everything that the causes need. In `LowState` a
 another robot, and in a table, kinematics and policy are missing. The causes that need them are then
 not examined, and the answer lists them.
 
-The limits are those of healthy walks. Other motions, such as those of `quadvel excite`, and drives
-with friction can exceed them: in a chirp log, the friction of a calf was wrongly named
-`joint_offset`. If the recording reports no walk, the answer has a note; `quadvel identify` is for
-such logs.
+The limits are those of healthy walks. Other motions and drives with friction can exceed them. Of a
+robot that hangs, whose feet carry less than half of its weight, nothing about feet and ground is
+examined; of one that only stands, no gains. If the recording reports no walk, the answer has a
+note; `quadvel identify` is for such logs.
 
 A policy of another project (`quadvel policy import`) is not replayed; `--policy none` does
 the same for one of this project.

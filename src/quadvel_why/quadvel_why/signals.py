@@ -148,8 +148,8 @@ class Signals:
         run = self.run
         dt = np.diff(run.time)[:, None]
         # Repeated states show no motion, and the states after them that of two periods.
-        steps = (dt[:, 0] < 2.5 * run.period) & ~self.repeated[1:] & ~self.repeated[:-1]
-        slope = (np.diff(run.q, axis=0) / dt)[steps]
+        steps = (dt[:, 0] > 0.0) & (dt[:, 0] < 2.5 * run.period) & ~self.repeated[1:] & ~self.repeated[:-1]
+        slope = np.diff(run.q, axis=0)[steps] / dt[steps]
         speed = (0.5 * (run.dq[1:] + run.dq[:-1]))[steps]
         found = np.full(len(run.joints), np.nan)
         for j in range(len(run.joints)):

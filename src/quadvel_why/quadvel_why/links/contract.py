@@ -103,7 +103,7 @@ class JointScale(Cause):
         off, j, what, factor = max(found)
         span = worst_span(run.time, np.abs(run.dq[:, j]))
         if what == "speed":
-            dt = np.diff(run.time)
+            dt = np.maximum(np.diff(run.time), 1e-6)  # s; repeated states have one stamp
             slopes = np.concatenate([[0.0], np.diff(run.q[:, j]) / dt])
             trace = Trace(
                 f"speed of {run.joints[j]} and slope of its angle, rad/s", run.time, run.dq[:, j], slopes
@@ -287,7 +287,7 @@ class JointOffset(Cause):
                         found, (size, j, f"{offset:+.3f} rad between the drive's angle and the recorded one")
                     )
         size, j, sentence = found
-        if size < self.least and {"imu", "robot"} <= signals.parts:
+        if size < self.least and {"imu", "robot"} <= signals.parts and not signals.legs.hangs:
             tried = best_offset(signals.legs)
             if tried is None:
                 return None if not sentence else Measurement(size)

@@ -119,8 +119,11 @@ class JammedJoint(Cause):
     @override
     def measure(self, signals: Signals) -> Measurement | None:
         run = signals.run
-        if {"torque", "imu"} <= signals.parts and signals.legs.plane.angle > WALKED_SLOPE_RAD:
-            return NOTHING  # on such ground sound joints rest for longer, too
+        if {"torque", "imu"} <= signals.parts:
+            if signals.legs.hangs:
+                return None  # whoever moves the joints of a suspended robot need not move them alike
+            if signals.legs.plane.angle > WALKED_SLOPE_RAD:
+                return NOTHING  # on such ground sound joints rest for longer, too
         width = min(round(REST_WINDOW_S / run.period), len(run.time) - 1)
         smooth = 2 * (width // 5) + 1
         others = np.convolve(np.median(np.abs(run.dq), axis=1), np.full(smooth, 1.0 / smooth), "same")

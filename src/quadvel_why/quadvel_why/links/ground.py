@@ -11,7 +11,7 @@ from quadvel_description.arrays import Array
 from quadvel_description.quadruped import GRAVITY
 
 from ..cause import Cause, Link, Measurement, Trace, worst_span
-from ..legs import WALKED_SLOPE_RAD, Legs
+from ..legs import HELD_SHARE, WALKED_SLOPE_RAD, Legs
 from ..signals import Signals
 
 LOADED_N = 60.0
@@ -24,8 +24,6 @@ MIN_WEIGHING_S = 1.0
 FOUND_MASS_SHARE = 0.946
 """Share of the mass that massless legs show in the torques, on the mean of healthy walks."""
 MASS_MARGIN_KG = 0.8
-HELD_SHARE = 0.5
-"""A robot whose feet carry less than this share of its weight hangs, or is held."""
 
 
 def _loaded(legs: Legs) -> Array:
@@ -45,7 +43,7 @@ class Slipping(Cause):
     def measure(self, signals: Signals) -> Measurement | None:
         run, legs = signals.run, signals.legs
         loaded = _loaded(legs)
-        if loaded.sum() < MIN_ROWS:
+        if loaded.sum() < MIN_ROWS or legs.hangs:
             return None
         world = (signals.estimate[:, None] @ legs.rotation.swapaxes(-1, -2))[:, 0]
         slip = np.linalg.norm((legs.velocity - world[:, None])[..., :2], axis=-1)
@@ -73,7 +71,7 @@ class SteepGround(Cause):
     @override
     def measure(self, signals: Signals) -> Measurement | None:
         plane = signals.legs.plane
-        if len(plane.time) < MIN_ROWS:
+        if len(plane.time) < MIN_ROWS or signals.legs.hangs:
             return None
         angle = plane.angle
         trace = Trace(
@@ -101,7 +99,7 @@ class RoughGround(Cause):
     @override
     def measure(self, signals: Signals) -> Measurement | None:
         plane = signals.legs.plane
-        if len(plane.time) < MIN_ROWS:
+        if len(plane.time) < MIN_ROWS or signals.legs.hangs:
             return None
         off = np.abs(plane.heights - plane.on_slope)
         value = max((float(np.percentile(off[rows], 80)) for rows in _windows(plane.time)), default=0.0)
