@@ -64,11 +64,10 @@ class _PanelGroup(TyperGroup):
         try:
             return super().invoke(ctx)
         except typer.BadParameter as error:
-            for one in getattr(error.__cause__, "errors", list[Any])()[
-                :1
-            ]:  # of pydantic, by which typer checks
-                if (found := one["input"]) is not None and repr(found) not in error.message:
-                    error.message = f"found {found!r}: {error.message}"
+            of_pydantic = getattr(error.__cause__, "errors", None)  # by which typer checks values
+            found = of_pydantic()[0]["input"] if of_pydantic else None
+            if found is not None and repr(found) not in error.message:
+                error.message = f"found {found!r}: {error.message}"
             raise
 
     def format_help(self, ctx: Any, formatter: Any) -> None:

@@ -89,10 +89,16 @@ def check_stack(stack: Stack) -> None:
         stack: The nodes and their parameters.
     """
     quadvel_dds.install()
-    _check_file(stack.parameters)
+    overrides = _check_file(stack.parameters)
     arguments = stack.arguments()
     checked = [name for name in arguments if name in NODE_CHECKS]
-    _check_values_of_file(stack.parameters, checked)
+    for name in checked:
+        installed_node(name)
+        values = {one.name: one.value for one in overrides if one.applies_to(f"/{name}")}
+        try:
+            _record(name, NODE_CHECKS[name], values)
+        except ValueError as error:
+            raise ValueError(f"{stack.parameters}: {error}") from None
     # The controller comes first: a robot without a policy needs no estimator.
     settings = {name: check_node(name, arguments[name]) for name in sorted(checked, key="controller".__ne__)}
     _check_same_robot({name: settings[name].robot for name in checked if hasattr(settings[name], "robot")})
@@ -149,8 +155,8 @@ def check_arguments(name: str, arguments: Sequence[str]) -> None:
     )
 
 
-def _check_file(file: Path) -> None:
-    """Check that a parameter file names only nodes and parameters that exist, also of nodes that do not start."""
+def _check_file(file: Path) -> Sequence[ParameterOverride]:
+    """Read a parameter file; check that it names only nodes and parameters that exist, also of nodes that do not start."""
     try:
         overrides = read_parameter_file(file)
     except ValueError as error:
@@ -161,17 +167,7 @@ def _check_file(file: Path) -> None:
         _check_names(overrides, {f"/{node}": node for node in NODES})
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
-
-
-def _check_values_of_file(file: Path, names: Iterable[str]) -> None:
-    """Check types and ranges of the values that a parameter file gives to nodes."""
-    found = parse(["--ros-args", "--params-file", str(file)])
-    for name in names:
-        installed_node(name)
-        try:
-            _record(name, NODE_CHECKS[name], found.parameters_for(f"/{name}"))
-        except ValueError as error:
-            raise ValueError(f"{file}: {error}") from None
+    return overrides
 
 
 def _check_names(overrides: Iterable[ParameterOverride], nodes: Mapping[str, str], running: str = "") -> None:

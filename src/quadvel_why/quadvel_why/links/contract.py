@@ -344,7 +344,8 @@ class Gains(Cause):
         run, trained = signals.run, signals.trained.gains
         if run.temperature is not None and run.temperature.value.max() > HOT_DEG_C:
             return NOTHING  # `temperature` explains weaker gains
-        fits = [fit for fit in signals.torque.fits if fit.has_moved]
+        moved = [j for j, fit in enumerate(signals.torque.fits) if fit.has_moved]
+        fits = [signals.torque.fits[j] for j in moved]
         if len(fits) < MIN_AGREEING_JOINTS * len(run.joints) // 12:
             return None
         kp = np.array([fit.command for fit in fits]) / trained[0]
@@ -363,8 +364,7 @@ class Gains(Cause):
         if not found:
             return NOTHING
         off, name, middle = max(found)
-        off_by = [abs(math.log(max(fit.command / trained[0], 1e-3))) for fit in signals.torque.fits]
-        worst = int(np.argmax(off_by))
+        worst = moved[int(np.argmax(np.abs(np.log(np.maximum(kp, 1e-3)))))]
         share = middle * trained[0 if name == "kp" else 1]
         sentence = (
             f"{name}: the drives act with {share:.2f} of the commanded gain, expected {share / middle:.2f}"
