@@ -190,6 +190,8 @@ def test_the_targets_of_the_script_do_not_jump_over_a_cycle(vx):
         angular_velocity=np.zeros((n, 3)),
         planar_velocity=np.tile([vx, 0.1, 0.3], (n, 1)),
         height=np.full(n, 0.39),
+        ground_slope=np.zeros((n, 2)),
+        ground_lean=np.zeros((n, 2)),
         stand_q=ALIENGO.nominal_q + np.tile([0.0, 0.05, 0.3], 4),  # targets that hold its weight
     )
     clock = GaitClock(n)

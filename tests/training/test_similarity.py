@@ -58,6 +58,8 @@ def test_the_script_moves_robots_of_all_sizes_alike(monkeypatch):
     small = SimpleNamespace(nominal_q=ALIENGO.nominal_q, legs=legs)
     state = {
         "roll_pitch": rng.normal(0.0, 0.1, (n, 2)),
+        "ground_slope": rng.normal(0.0, 0.1, (n, 2)),
+        "ground_lean": rng.normal(0.0, 0.1, (n, 2)),
         "angular_velocity": rng.normal(0.0, 1.0, (n, 3)),
         "planar_velocity": rng.normal(0.0, 1.0, (n, 3)),
         "height": rng.uniform(0.3, 0.5, n),

@@ -443,6 +443,12 @@ class VelocityEnv:
         """Drop of the ground below the feet per metre forward and per metre to the left, (n, 2)."""
         return np.stack(self._ground_drop(self._ground(self.feet)), axis=-1)
 
+    @property
+    def ground_lean(self) -> np.ndarray:
+        """Roll and pitch of a trunk that is parallel to the ground below the feet, (n, 2), rad."""
+        forward, left = self.ground_slope.T
+        return np.arctan(np.stack([-left, forward], axis=1))
+
     def _push(self) -> None:
         """Push some robots: a sudden change of velocity."""
         r = self.config.randomisation

@@ -2,8 +2,8 @@
 
 Feet follow the gait clock: swings rise and return, stances sweep at the planned velocity. Feedbacks
 of the true state keep robots on their feet: feet are placed by the excess velocity and by the way
-that the robot lags behind, the trunk is levelled and kept at its height, feet turn against a wrong
-yaw rate. In curves the feet are placed further out. The gains were found by a search over walks of
+that the robot lags behind, the trunk is kept parallel to the ground and at its height, feet turn against a wrong
+yaw rate. In curves the feet are placed further out, on slopes further down. The gains were found by a search over walks of
 robots drawn as in training, without a network. Lengths, times and speeds hold for a robot of the
 reference size; those of others follow by `similarity`.
 """
@@ -30,9 +30,10 @@ DRAG = np.array([0.0105, 0.0])  # s^2/m, and this times its square: joints push 
 MAX_BEHIND = np.array([0.46, 2.0])  # m/s, planned velocity that counts
 MAX_EXCESS = 0.5  # m/s, excess velocity that counts
 CURVE = 0.87  # share of the acceleration in a curve for which feet are placed out
+DOWNHILL = 0.8  # share of the way from below the hips to below the trunk on a slope by which feet are placed
 TURN_S = 0.064  # feet are turned about the trunk by this time times the excess yaw rate
 MAX_YAW_EXCESS = 1.5  # rad/s, excess yaw rate that counts
-LEVELLING = np.array([1.68, 0.87])  # roll, pitch: share of the tilt that stance feet push back
+LEVELLING = np.array([1.68, 0.87])  # roll, pitch: share of the tilt to the ground that stance feet push back
 RATE_S = np.array([0.068, 0.112])  # time that a roll or pitch rate is extrapolated
 HEIGHT_GAIN = 0.37  # share of the height above HEIGHT_M by which stance feet of a walk give way,
 MAX_HEIGHT_ERROR_M = 0.1  # up to this error
@@ -70,12 +71,14 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.nda
     along = np.where(down, 1.0 - 2.0 * phases / duty[:, None], -np.cos(np.pi * swing))
     along *= clock.walking[:, None]
     # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_planned) - CATCH_UP lag
-    #     - CURVE (h / g) w x v_planned + TURN_S (w_z - w_planned) x (x_nominal)
+    #     - CURVE (h / g) w x v_planned + DOWNHILL h slope + TURN_S (w_z - w_planned) x (x_nominal)
     #     - loaded (BEHIND_S clip(v_planned) + DRAG |v_planned| v_planned)
     # A trunk at height h above feet that are a distance d aside accelerates by g d / h. The last
     # term acts in stance alone: joints push the trunk forward, and swings end further ahead.
     placed = PLACEMENT_S * excess - CATCH_UP * lag / size.length * clock.walking[:, None]
     placed -= CURVE * HEIGHT_M / GRAVITY * _turned(planned[:, None, :2], planned[:, 2])[:, 0]
+    slope = env.ground_slope
+    placed += DOWNHILL * HEIGHT_M * slope
     behind = BEHIND_S * np.clip(planned[:, :2], -MAX_BEHIND, MAX_BEHIND)
     behind = behind + DRAG * np.abs(planned[:, :2]) * planned[:, :2]
     feet = np.broadcast_to(below, (len(planned), 4, 3)).copy()
@@ -84,9 +87,8 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.nda
     # z_foot = z_nominal + LIFT_M sin^2(pi s); a stance foot on the lower side of the trunk pushes
     # down: z_foot += y roll - x pitch, both extrapolated by RATE_S, times LEVELLING; while walking,
     # z_foot += HEIGHT_GAIN (h - HEIGHT_M)
-    roll, pitch = (LEVELLING * (env.roll_pitch + RATE_S * size.time * env.angular_velocity[:, :2])).T[
-        ..., None
-    ]
+    tilt = env.roll_pitch - env.ground_lean + RATE_S * size.time * env.angular_velocity[:, :2]
+    roll, pitch = (LEVELLING * tilt).T[..., None]
     level = below[:, 1] * roll - below[:, 0] * pitch
     above = (
         np.clip(env.height / size.length - HEIGHT_M, -MAX_HEIGHT_ERROR_M, MAX_HEIGHT_ERROR_M) * clock.walking

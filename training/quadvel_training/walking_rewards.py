@@ -208,10 +208,6 @@ class WalkingRewards:
     def _body(self, command: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
         """Rewards of trunk motion and smoothness."""
         env, w = self.env, self.weights
-        down_forward, down_left = env.ground_slope.T
-        # Drop of the ground per metre forward and left. A trunk parallel to the ground has
-        # roll = atan(-down_left), pitch = atan(down_forward).
-        lean = np.arctan(np.stack([-down_left, down_forward], axis=1))
         acceleration = (env.dq - self._dq) / env.config.period
         self._dq = env.dq.copy()
         speed = np.hypot(command[:, 0], command[:, 1])
@@ -219,7 +215,7 @@ class WalkingRewards:
         return {
             "bounce": -w.bounce * env.velocity[:, 2] ** 2
             - w.rocking * np.sum(env.angular_velocity[:, :2] ** 2, axis=1),
-            "tilt": -w.tilt * np.sum((env.roll_pitch - lean) ** 2, axis=1),
+            "tilt": -w.tilt * np.sum((env.roll_pitch - env.ground_lean) ** 2, axis=1),
             "height": -w.height * np.minimum((env.height - TARGET_HEIGHT_M * env.size.length) ** 2, 0.02),
             "power": -w.power * self._slowness(command) * env.power / (1 + 0.5 * speed),
             "acceleration": -w.acceleration * np.sum(acceleration**2, axis=1),
