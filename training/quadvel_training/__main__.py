@@ -53,8 +53,8 @@ from .card import card
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Train quadvel's policy and estimator. `all` runs the stages in order: privileged, dagger, constrained, "
-    "estimator; `ablation` and `tune` run constrained with other recipes. Ctrl-C saves; the same command resumes. "
+    help="Train quadvel's policy and estimator. `all` runs the stages in order: privileged, dagger, estimator; "
+    "`ablation` and `tune` run constrained, on a policy that walks. Ctrl-C saves; the same command resumes. "
     "torchrun trains in several processes, on several machines if these share the directory: "
     "torchrun --nproc-per-node 2 -m -- quadvel_training all",
 )
@@ -72,7 +72,6 @@ Minutes = Annotated[float | None, typer.Option(help="Time limit, minutes.")]
 Device = Annotated[str, typer.Option(help="Device of the networks: cpu or cuda. Physics runs on the CPU.")]
 TEACHER = Path("out/training/privileged") / stages.TEACHER
 STUDENT = Path("out/training/dagger") / stages.STUDENT
-POLICY = Path("out/training/constrained_fine") / stages.POLICY
 TeacherFile = Annotated[
     Path, typer.Option("--teacher", help="Checkpoint of `privileged`, also a numbered one.", dir_okay=False)
 ]
@@ -96,14 +95,14 @@ def _written(*paths: Path) -> None:
 
 
 @app.command("all")
-def train_everything(out: Out = Path("out/training"), device: Device = "cpu") -> None:
-    """Run all stages with their recipes, from random weights to policy and estimator; days on two cores.
+def train_everything(out: Out = Path("out/training")) -> None:
+    """Train the shipped policy and its estimator from random weights: privileged, dagger, estimator.
 
-    Writes DIR/constrained_fine/policy.onnx and DIR/estimator/estimator.onnx. The same command resumes it.
+    Writes DIR/dagger/policy.onnx and DIR/estimator/estimator.onnx. The same command resumes it.
     """
-    if not stages.train_all(out, device):
+    if not stages.train_all(out):
         raise typer.Exit(1)
-    _written(out / "constrained_fine" / stages.POLICY_FILE, out / "estimator" / stages.ESTIMATOR_FILE)
+    _written(out / "dagger" / stages.POLICY_FILE, out / "estimator" / stages.ESTIMATOR_FILE)
 
 
 @app.command("privileged")
@@ -208,7 +207,7 @@ def tune_policy(
         Path,
         typer.Option(help="Actuator file of `quadvel identify`.", exists=True, callback=_actuator_file),
     ],
-    policy: PolicyCheckpoint = POLICY,
+    policy: PolicyCheckpoint = STUDENT,
     minutes: Annotated[
         float, typer.Option(min=0.1, help="Duration, minutes; starts again when resumed.")
     ] = 20.0,
@@ -267,7 +266,7 @@ def close_the_loop(
 
 @app.command("estimator")
 def train_estimator(
-    policy: PolicyCheckpoint = POLICY,
+    policy: PolicyCheckpoint = STUDENT,
     out: Out = Path("out/training/estimator"),
     source: Recipe = None,
     minutes: Minutes = None,
@@ -278,7 +277,7 @@ def train_estimator(
 
 
 @app.command("kalman")
-def tune_kalman(policy: PolicyCheckpoint = POLICY, source: Recipe = None) -> None:
+def tune_kalman(policy: PolicyCheckpoint = STUDENT, source: Recipe = None) -> None:
     """Tune the Kalman filter's noise on the same kind of walks; prints the fields of `KalmanConfig`."""
     config = recipe.read_recipe(kalman_tuning.TuningConfig, source)
     recording = kalman_tuning.record(config, dagger.load_policy(policy))

@@ -1,6 +1,6 @@
 """The stages of training as they are run, each in its own folder, where it resumes.
 
-`train_all` runs them in turn; `train_ablation` and `tune` run stage 3 with other recipes.
+`train_all` runs those that make the shipped files; `train_ablation` and `tune` run stage 3.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from .teacher_walks import WalkLog
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 TEACHER_PARTS = ("privileged", "privileged_rough")  # recipes, in order
-POLICY_PARTS = {"constrained": "crl_eam", "constrained_fine": "crl_eam_fine"}  # folders and recipes, in order
 ABLATION = ("rl_pd", "rl_eam", "crl_eam")
 TEACHER, STUDENT, POLICY, ESTIMATOR = (
     "privileged.pt",
@@ -119,14 +118,13 @@ def train_estimator(config: EstimatorConfig, source: Path | None, policy: Path, 
     return spent
 
 
-def train_all(out: Path, device: str) -> bool:
-    """Run all stages from random weights, with the recipes of the project.
+def train_all(out: Path) -> bool:
+    """Train the shipped policy and its estimator from random weights, with the recipes of the project.
 
     It resumes where it was stopped.
 
     Args:
         out: folder for the run directories.
-        device: `cpu` or `cuda`.
 
     Returns:
         Whether all stages are done.
@@ -137,13 +135,7 @@ def train_all(out: Path, device: str) -> bool:
             return False
     if not train_student(*_recipe(DaggerConfig, "dagger"), teacher / TEACHER, student):
         return False
-    start = student / STUDENT
-    for folder, part in POLICY_PARTS.items():
-        stage3 = _recipe(ConstrainedConfig, part)
-        if not train_policy(*stage3, start, teacher / TEACHER, out / folder, device):
-            return False
-        start = out / folder / POLICY
-    return train_estimator(*_recipe(EstimatorConfig, "estimator"), start, estimator)
+    return train_estimator(*_recipe(EstimatorConfig, "estimator"), student / STUDENT, estimator)
 
 
 def _recipe(kind: type[Any], name: str) -> tuple[Any, Path]:

@@ -24,9 +24,10 @@ PAST_MIRROR = symmetry.concatenate_mirrors(
         symmetry.sign_mirror(1, -1),  # lag
         symmetry.sign_mirror(-1, -1),  # phase of the steps
         privileged.PLANAR,  # planned velocity
+        symmetry.sign_mirror(1, -1),  # slope of the ground
     ]
 )
-PAST_SIZE = len(PAST_MIRROR.index)  # what the teacher observes of the past
+PAST_SIZE = len(PAST_MIRROR.index)
 AVERAGED_TICKS = 3
 """Ticks over which a teacher that drives averages its actions: held actions act late by as much"""
 LABEL_BEFORE, LABEL_AFTER = 3, 1
@@ -100,14 +101,15 @@ class Teacher:
         self._executed.append(executed.clip(-ACTION_BOUND, ACTION_BOUND))
 
     def past_features(self) -> np.ndarray:
-        """Return what the teacher observes of the past, which a memory has to keep.
+        """Return what the teacher observes of past and ground, which a memory has to keep or to infer.
 
         Returns:
-            (n, PAST_SIZE), scaled to about 1: errors over a stride and lasting ones, lag, plan.
+            (n, PAST_SIZE), scaled to about 1: errors over a stride and lasting ones, lag, plan, slope
+            of the ground.
         """
-        past = self.past
+        past, slope = self.past, self.env.ground_slope
         return np.concatenate(
-            [3 * past.stride, 12 * past.lasting, 8 * past.lag, past.clock.observation()], axis=1
+            [3 * past.stride, 12 * past.lasting, 8 * past.lag, past.clock.observation(), 5 * slope], axis=1
         ).astype(np.float32)
 
 
