@@ -8,9 +8,10 @@ student falls far more often than by itself, and its advice is worth little. Eac
 place in the order in which the student takes over. If drivers were drawn for each episode, few
 robots would stay with a student that falls soon.
 
-The student has to remember what the teacher observes of the past: errors over a stride and over
-seconds, and the phase of its steps. So its sequences last for seconds, and a linear map from its
-memory, which is not part of the policy, learns to predict these numbers.
+The student has to remember what the teacher observes of the past, errors over a stride and over
+seconds and the phase of its steps, and to infer the slope of the ground. So its sequences last for
+seconds, and a linear map from its memory, which is not part of the policy, learns to recall these
+numbers.
 
 Half of the sequences are learned as their mirror images, so that the student walks alike to both
 sides. Robots that stand are left out there: whoever answers left and right alike cannot choose the
@@ -52,11 +53,11 @@ from .onnx_file import commit, export
 from .ppo import IMITATION_HUBER_DELTA, masked_mean
 from .privileged import ACTION_BOUND, ACTION_SCALE
 from .randomisation import Randomisation, load_actuator
-from .teacher import PAST_MIRROR, PAST_SIZE, Teacher, smooth_labels
+from .teacher import RECALLED_MIRROR, RECALLED_SIZE, Teacher, smooth_labels
 from .walking_rewards import error_magnitudes
 
-MIRRORS = tuple(torch_mirror(mirror) for mirror in (symmetry.OBSERVATION, symmetry.JOINTS, PAST_MIRROR))
-"""Of observations, actions, and what the teacher observes of the past"""
+MIRRORS = tuple(torch_mirror(mirror) for mirror in (symmetry.OBSERVATION, symmetry.JOINTS, RECALLED_MIRROR))
+"""Of observations, actions, and recalled features"""
 SLOW_CELLS, LONGEST_MEMORY_S = MEMORY // 4, 4.0  # cells of a new student that forget slowly, up to this time
 QUIET = 2  # every second robot does not explore
 
@@ -78,7 +79,7 @@ class DaggerConfig:
         driven: share of robots that the student drives at the end.
         first_driven: the same at the start.
         takeover: samples from `first_driven` to `driven`.
-        recall: weight of the squared error of a linear map from the memory to the past features.
+        recall: weight of the squared error of a linear map from the memory to the recalled features.
         averaged: sequences over which the weights of the policy file are averaged; 16 are 2 million
             samples of 512 robots.
         noise: standard deviation of the noise of the actions of robots that explore, in the network's
@@ -125,13 +126,13 @@ class Experience:
     Attributes:
         obs: (T, N, 48), observations.
         label: (T, N, 12), actions of the teacher, averaged over `LABEL_BEFORE` to `LABEL_AFTER`.
-        past: (T, N, PAST_SIZE), what the teacher observes of the past.
+        recalled: (T, N, RECALLED_SIZE), what the teacher observes and a student has to recall.
         mask: (T, N), 1 for robots that are up, and count.
     """
 
     obs: Tensor
     label: Tensor
-    past: Tensor
+    recalled: Tensor
     mask: Tensor
 
     def with_mirror_images(self, standing: Tensor) -> Experience:
@@ -144,7 +145,7 @@ class Experience:
             T ticks of 2 N robots, the mirror images last.
         """
         mirrored = [
-            mirror(own) for mirror, own in zip(MIRRORS, (self.obs, self.label, self.past), strict=True)
+            mirror(own) for mirror, own in zip(MIRRORS, (self.obs, self.label, self.recalled), strict=True)
         ]
         pairs = zip(
             attrs.astuple(self, recurse=False), [*mirrored, self.mask * (1.0 - standing)], strict=True
@@ -186,7 +187,7 @@ class DaggerRun:
         self.student = Recurrent(OBSERVATION_SIZE, 12)
         lengthen_memory(self.student.lstm, SLOW_CELLS, LONGEST_MEMORY_S / TICK_S)
         self.average = copy.deepcopy(self.student)
-        self.recall = torch.nn.Linear(MEMORY, PAST_SIZE)
+        self.recall = torch.nn.Linear(MEMORY, RECALLED_SIZE)
         self.map = action_map(self.env)
         self.optimiser = torch.optim.Adam(self._learning().parameters(), lr=c.learning_rate)
         self.samples = self._sequences = 0
@@ -291,7 +292,7 @@ class DaggerRun:
         standing = []
         for _ in range(c.length):
             obs, advice = observe(self.env, self._previous), self.teacher.action()
-            seen = obs, self.teacher.latest, self.teacher.past_features(), alive.copy()
+            seen = obs, self.teacher.latest, self.teacher.recalled_features(), alive.copy()
             for values, value in zip(rows.values(), seen, strict=True):
                 values.append(value)
             standing.append(self._stands())
@@ -363,11 +364,11 @@ class DaggerRun:
         losses = []
         for ids in itertools.chain(*passes):
             memory, _ = self.student.lstm(e.obs[:, ids], select(start, ids))
-            # L = mean(Huber(action - label)) + recall mean(|A memory + b - past|^2)
+            # L = mean(Huber(action - label)) + recall mean(|A memory + b - recalled|^2)
             huber = torch.nn.functional.huber_loss(
                 self.student.answer(memory), e.label[:, ids], reduction="none", delta=IMITATION_HUBER_DELTA
             )
-            missed = (self.recall(memory) - e.past[:, ids]) ** 2
+            missed = (self.recall(memory) - e.recalled[:, ids]) ** 2
             imitation, recall = (masked_mean(error.mean(-1), e.mask[:, ids]) for error in (huber, missed))
             self.optimiser.zero_grad()
             (imitation + c.recall * recall).backward()

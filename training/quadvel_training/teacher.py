@@ -17,7 +17,7 @@ from .privileged import ACTION_BOUND
 from .walking_rewards import SAMPLE_S
 
 HOLD_TICKS = round(SAMPLE_S / TICK_S)  # the teacher learned with actions held for so long
-PAST_MIRROR = symmetry.concatenate_mirrors(
+RECALLED_MIRROR = symmetry.concatenate_mirrors(
     [
         privileged.PLANAR,  # error over a stride
         privileged.PLANAR,  # lasting error
@@ -27,7 +27,7 @@ PAST_MIRROR = symmetry.concatenate_mirrors(
         symmetry.sign_mirror(1, -1),  # slope of the ground
     ]
 )
-PAST_SIZE = len(PAST_MIRROR.index)
+RECALLED_SIZE = len(RECALLED_MIRROR.index)
 AVERAGED_TICKS = 3
 """Ticks over which a teacher that drives averages its actions: held actions act late by as much"""
 LABEL_BEFORE, LABEL_AFTER = 3, 1
@@ -100,11 +100,11 @@ class Teacher:
         self.past.advance(command)
         self._executed.append(executed.clip(-ACTION_BOUND, ACTION_BOUND))
 
-    def past_features(self) -> np.ndarray:
+    def recalled_features(self) -> np.ndarray:
         """Return what the teacher observes of past and ground, which a memory has to keep or to infer.
 
         Returns:
-            (n, PAST_SIZE), scaled to about 1: errors over a stride and lasting ones, lag, plan, slope
+            (n, RECALLED_SIZE), scaled to about 1: errors over a stride and lasting ones, lag, plan, slope
             of the ground.
         """
         past, slope = self.past, self.env.ground_slope
