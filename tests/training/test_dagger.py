@@ -166,7 +166,7 @@ def test_the_student_learns_mirror_images_of_robots_that_do_not_stand(run):
         both.label[:, SMALL.n].unflatten(-1, (4, 3))[:, 1],
     )
     assert left.equal(right * torch.tensor([-1.0, 1.0, 1.0]))  # FR as FL
-    assert both.past[:, SMALL.n, 6:8].equal(experience.past[:, 0, 6:8] * torch.tensor([1.0, -1.0]))  # lag
+    assert both.recalled[:, SMALL.n, 6:8].equal(experience.recalled[:, 0, 6:8] * torch.tensor([1.0, -1.0]))  # lag
     _, end = run.student(both.obs, start)
     assert (
         run._memory[0].isclose(end[0], atol=1e-5).all()
@@ -181,7 +181,7 @@ def test_half_of_what_is_learned_are_mirror_images(teacher_file, monkeypatch):
         both = experience.with_mirror_images(0.0 * standing)
         if swapped:
             turn = torch.arange(2 * SMALL.n).roll(SMALL.n)
-            both = dagger.Experience(*(x[:, turn] for x in (both.obs, both.label, both.past, both.mask)))
+            both = dagger.Experience(*(x[:, turn] for x in (both.obs, both.label, both.recalled, both.mask)))
             start = (start[0][:, turn], start[1][:, turn])
         monkeypatch.setattr(torch, "randint", lambda low, high, size: torch.full(size, chosen))
         run.learn(both, start)
