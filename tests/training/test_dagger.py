@@ -166,7 +166,9 @@ def test_the_student_learns_mirror_images_of_robots_that_do_not_stand(run):
         both.label[:, SMALL.n].unflatten(-1, (4, 3))[:, 1],
     )
     assert left.equal(right * torch.tensor([-1.0, 1.0, 1.0]))  # FR as FL
-    assert both.recalled[:, SMALL.n, 6:8].equal(experience.recalled[:, 0, 6:8] * torch.tensor([1.0, -1.0]))  # lag
+    assert both.recalled[:, SMALL.n, 6:8].equal(
+        experience.recalled[:, 0, 6:8] * torch.tensor([1.0, -1.0])
+    )  # lag
     _, end = run.student(both.obs, start)
     assert (
         run._memory[0].isclose(end[0], atol=1e-5).all()

@@ -201,11 +201,19 @@ def test_on_a_slope_the_trunk_stays_parallel_to_the_ground_and_the_feet_are_plac
     assert moved[:, 2] == pytest.approx(0.0, abs=3e-3)
 
 
+def test_a_robot_that_walks_sideways_places_its_feet_behind(weightless, monkeypatch):
+    env = VelocityEnv(CALM)
+    placed = walking_feet(env, [0.0, 0.5, 0.0], [0.0, 0.0])
+    monkeypatch.setattr(scripted_trot, "SIDEWAYS_S", 0.0)
+    moved = placed - walking_feet(env, [0.0, 0.5, 0.0], [0.0, 0.0])
+    assert moved[:, :2] == pytest.approx(np.tile([0.0, -0.035], (4, 1)), abs=2e-3)
+
+
 def test_in_a_curve_the_feet_are_placed_out_by_what_the_centripetal_acceleration_takes(weightless):
     env = VelocityEnv(CALM)
     left, right = (walking_feet(env, [1.5, 0.0, turn], [0.0, 0.0]) for turn in (1.0, -1.0))
     # a trunk at height h accelerates by g d / h towards the side from which its feet are d away
-    out = 0.87 * 1.5 * 1.0 * 0.358 / 9.81
+    out = scripted_trot.CURVE * 1.5 * 1.0 * 0.358 / 9.81
     assert (right - left)[:, 1].mean() == pytest.approx(2 * out, rel=0.05)
 
 

@@ -29,7 +29,10 @@ BEHIND_S = np.array([0.092, 0.037])  # targets of stance feet are this time time
 DRAG = np.array([0.0105, 0.0])  # s^2/m, and this times its square: joints push the trunk forward
 MAX_BEHIND = np.array([0.46, 2.0])  # m/s, planned velocity that counts
 MAX_EXCESS = 0.5  # m/s, excess velocity that counts
-CURVE = 0.87  # share of the acceleration in a curve for which feet are placed out
+SIDEWAYS_S = (
+    0.07  # feet are placed this time times the planned sideways velocity behind: a sideways trot is slow
+)
+CURVE = 1.6  # feet are placed out by this multiple of what the acceleration in a curve takes
 DOWNHILL = 0.8  # share of the way from below the hips to below the trunk on a slope by which feet are placed
 TURN_S = 0.064  # feet are turned about the trunk by this time times the excess yaw rate
 MAX_YAW_EXCESS = 1.5  # rad/s, excess yaw rate that counts
@@ -71,14 +74,15 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.nda
     along = np.where(down, 1.0 - 2.0 * phases / duty[:, None], -np.cos(np.pi * swing))
     along *= clock.walking[:, None]
     # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_planned) - CATCH_UP lag
-    #     - CURVE (h / g) w x v_planned + DOWNHILL h slope + TURN_S (w_z - w_planned) x (x_nominal)
+    #     - SIDEWAYS_S v_planned,y - CURVE (h / g) w x v_planned + DOWNHILL h slope
+    #     + TURN_S (w_z - w_planned) x (x_nominal)
     #     - loaded (BEHIND_S clip(v_planned) + DRAG |v_planned| v_planned)
     # A trunk at height h above feet that are a distance d aside accelerates by g d / h. The last
     # term acts in stance alone: joints push the trunk forward, and swings end further ahead.
     placed = PLACEMENT_S * excess - CATCH_UP * lag / size.length * clock.walking[:, None]
+    placed[:, 1] -= SIDEWAYS_S * planned[:, 1]
     placed -= CURVE * HEIGHT_M / GRAVITY * _turned(planned[:, None, :2], planned[:, 2])[:, 0]
-    slope = env.ground_slope
-    placed += DOWNHILL * HEIGHT_M * slope
+    placed += DOWNHILL * HEIGHT_M * env.ground_slope
     behind = BEHIND_S * np.clip(planned[:, :2], -MAX_BEHIND, MAX_BEHIND)
     behind = behind + DRAG * np.abs(planned[:, :2]) * planned[:, :2]
     feet = np.broadcast_to(below, (len(planned), 4, 3)).copy()
