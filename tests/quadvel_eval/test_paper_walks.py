@@ -17,6 +17,7 @@ from quadvel_eval.paper.identification import record_foot_lifting
 from quadvel_eval.paper.letters import Letters
 from quadvel_eval.paper.section import Row, Section, Study
 from quadvel_eval.paper.stance import Stance
+from quadvel_eval.paper.steps import Steps
 from quadvel_eval.paper.sustained import Sustained
 from quadvel_eval.paper.symmetry import Symmetry
 from quadvel_policy.policy_file import SHIPPED_POLICY
@@ -67,6 +68,13 @@ def test_a_walk_has_gait_cycles_on_all_legs(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(symmetry, "WALK_DURATION_S", 3.0)
     monkeypatch.setattr(symmetry, "SETTLING_TIME_S", 1.0)
     assert 0.0 < ours(Symmetry(speeds=(0.8,)))["asymmetry at 0.8 m/s"] < 0.8
+
+
+def test_short_episodes_of_random_commands_end_on_the_feet_or_at_a_time() -> None:
+    section = Steps(episodes=2, seconds=1.0)
+    found = ours(section)
+    assert found["episodes"] == 2
+    assert found["episodes that end in a fall"] in (0.0, 50.0, 100.0)
 
 
 def test_a_robot_that_stands_drifts_little(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,6 +27,7 @@ from .robustness import Robustness
 from .section import Section, Study
 from .slopes import Slopes
 from .stance import Stance
+from .steps import Steps
 from .sustained import Sustained
 from .symmetry import Symmetry
 from .tracking import Tracking
@@ -38,6 +39,7 @@ SECTIONS: tuple[Section, ...] = (
     Jitter(),
     Tracking(),
     Sustained(),
+    Steps(),
     Letters(),
     Energy(),
     Robustness(),
