@@ -89,7 +89,7 @@ def test_the_teacher_knows_what_was_done_20_ms_ago(run):
 
 def test_the_teachers_actions_lag_as_held_ones_do_and_restart_with_a_robot(run, monkeypatch):
     teacher, values = run.teacher, iter([0.3, 0.6, 0.9, 1.2])
-    monkeypatch.setattr(privileged, "joint_offsets", lambda env, clock, lag: np.zeros((8, 12)))
+    monkeypatch.setattr(privileged, "joint_offsets", lambda env, past: np.zeros((8, 12)))
     teacher.actor = lambda obs: (torch.full((8, 12), next(values)), None)
     said = [teacher.action()[:, 0] for _ in range(3)]
     assert [one[0] for one in said] == pytest.approx([0.3, 0.4, 0.6])

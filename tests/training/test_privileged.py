@@ -17,8 +17,7 @@ from quadvel_sim.terrain import Terrain  # noqa: E402
 from quadvel_training import loop, privileged, process_group, scripted_trot  # noqa: E402
 from quadvel_training.command_grid import CELL_WIDTH, INITIAL_REACH, CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import EnvConfig, VelocityEnv  # noqa: E402
-from quadvel_training.gait_clock import GaitClock  # noqa: E402
-from quadvel_training.past import LASTING_S, MAX_LAG_M, STANDING_S, TRANSIENT_S, Past  # noqa: E402
+from quadvel_training.past import CATCH_UP_TURN, LASTING_S, MAX_LAG, STANDING_S, TRANSIENT_S, Past  # noqa: E402
 from quadvel_training.privileged import (  # noqa: E402
     CommandScorer,
     NumberedCheckpoints,
@@ -153,8 +152,8 @@ def test_the_mirrored_robot_observes_the_mirror_image():
     env._update_state()
     past.advance(env.command)
     past.clock.phase[:] = [0.2, 0.7]  # mirrored steps come half a cycle later
-    past.lag[:] = [[0.1, 0.05], [0.1, -0.05]]
-    trot = joint_offsets(env, past.clock, past.lag)
+    past.lag[:], past.clock.walking[:] = [[0.1, 0.05, 0.2], [0.1, -0.05, -0.2]], True
+    trot = joint_offsets(env, past)
     assert trot[1] == pytest.approx(symmetry.JOINTS(trot[0]), abs=1e-4)
     one, other = privileged.observe(env, past, np.stack([joints, symmetry.JOINTS(joints)]))
     assert np.allclose(privileged.MIRROR(one), other, atol=1e-5)
@@ -162,10 +161,10 @@ def test_the_mirrored_robot_observes_the_mirror_image():
 
 def walking_feet(env: VelocityEnv, planned: list[float], lag: list[float]) -> np.ndarray:
     """Feet (4, 3) of the scripted trot of a robot that moves as planned."""
-    clock = GaitClock(4)
-    clock.walking[:], clock.velocity[:] = True, planned
+    past = Past(env)
+    past.clock.walking[:], past.clock.velocity[:], past.lag[:, : len(lag)] = True, planned, lag
     env.velocity[:, :2], env.angular_velocity[:] = planned[:2], [0.0, 0.0, planned[2]]
-    offsets = joint_offsets(env, clock, np.tile(lag, (4, 1)))
+    offsets = joint_offsets(env, past)
     return foot_positions(ALIENGO, ALIENGO.nominal_q + offsets[0])
 
 
@@ -199,6 +198,19 @@ def test_on_a_slope_the_trunk_stays_parallel_to_the_ground_and_the_feet_are_plac
     behind = scripted_trot.DOWNHILL * scripted_trot.HEIGHT_M * math.tan(rise)
     assert moved[:, :2] == pytest.approx(np.tile([-behind, 0.0], (4, 1)), abs=3e-3)
     assert moved[:, 2] == pytest.approx(0.0, abs=3e-3)
+
+
+def test_a_robot_that_turned_too_little_is_told_to_turn_faster():
+    env = VelocityEnv(CALM)
+    env.command[:], past, previous = [0.5, 0.0, 1.0, 0.0], Past(env), np.zeros((4, 12))
+    past.clock.walking[:], past.clock.velocity[:] = True, [0.5, 0.0, 1.0]
+    usual = privileged.observe(env, past, previous)
+    past.lag[1:, 2] = 0.1  # rad
+    told = privileged.observe(env, past, previous) - usual
+    assert told[1:, [2, -1]] == pytest.approx(0.1 * CATCH_UP_TURN)  # command and plan
+    assert not told[0].any()
+    past.clock.walking[:] = False
+    assert not past.turn_correction.any()
 
 
 def test_a_robot_that_walks_sideways_places_its_feet_behind(weightless, monkeypatch):
@@ -268,7 +280,7 @@ def test_an_error_that_lasts_is_that_of_this_command_alone_and_without_its_begin
     for _ in range(round(10 * LASTING_S / env.config.period)):
         past.advance(command)
     assert past.lasting == pytest.approx(np.tile(error, (4, 1)), rel=1e-3)
-    assert past.lag == pytest.approx(np.tile([MAX_LAG_M, -MAX_LAG_M], (4, 1)))
+    assert past.lag == pytest.approx(np.tile([MAX_LAG, -MAX_LAG, MAX_LAG], (4, 1)))
     env.changed[1] = True
     past.advance(command)
     env.changed[:] = False

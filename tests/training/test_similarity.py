@@ -66,10 +66,11 @@ def test_the_script_moves_robots_of_all_sizes_alike(monkeypatch):
         "stand_q": ALIENGO.nominal_q + 0.1,
     }
     large = SimpleNamespace(robot=ALIENGO, size=Size(), **state)
-    lag, clock = rng.normal(0.0, 0.1, (n, 2)), GaitClock(n)
+    lag, turn, clock = rng.normal(0.0, 0.1, (n, 2)), rng.normal(0.0, 0.2, n), GaitClock(n)
     clock.velocity, clock.phase = rng.normal(0.0, 1.0, (n, 3)), rng.uniform(0.0, 1.0, n)
     clock.walking[:] = True
-    expected = scripted_trot.joint_offsets(large, clock, lag)
+    past = SimpleNamespace(clock=clock, lag=lag, turn_correction=turn)
+    expected = scripted_trot.joint_offsets(large, past)
 
     speeds, rates = np.array([size.time, size.time, 1 / size.time]), 1 / size.time
     alike = state | {
@@ -82,7 +83,6 @@ def test_the_script_moves_robots_of_all_sizes_alike(monkeypatch):
     its_clock.walking[:] = True
     # the lead is that of the drives, which does not scale
     monkeypatch.setattr(scripted_trot, "LEAD_S", lead * size.time)
-    found = scripted_trot.joint_offsets(
-        SimpleNamespace(robot=small, size=size, **alike), its_clock, lag * size.length
-    )
+    its_past = SimpleNamespace(clock=its_clock, lag=lag * size.length, turn_correction=turn / size.time)
+    found = scripted_trot.joint_offsets(SimpleNamespace(robot=small, size=size, **alike), its_past)
     np.testing.assert_allclose(found, expected, atol=1e-12)

@@ -12,7 +12,10 @@ from .gait_clock import GaitClock
 
 STRIDE_S = 0.35  # time constant of stride errors: about a stride
 LASTING_S = 1.5  # time constant of lasting errors
-MAX_LAG_M = 0.4  # a robot that does not follow is not to make up for more later
+MAX_LAG = 0.4  # m, m, rad: a robot that does not follow is not to make up for more later
+CATCH_UP_TURN = (
+    2.0  # 1/s: a teacher is told to turn faster by this times the angle that the robot lags behind
+)
 TRANSIENT_S = 1.0  # after the plan has reached a command, not part of lasting errors and scores
 STANDING_S = 0.2  # on four feet; after that, setting off means choosing a side
 
@@ -26,7 +29,7 @@ class Past:
             `STRIDE_S`.
         lasting: (n, 3), the same over `LASTING_S`; set to zero by a new command, it changes while
             the robot is `settled`.
-        lag: (n, 2), m, the integral of the error in vx and vy, over the same time as `lasting`.
+        lag: (n, 3), m, m, rad, the integral of the error, over the same time as `lasting`.
         air: (n, 4), s since the foot left the ground; 0 on the ground.
         down: (n, 4), s since the foot touched the ground; 0 in the air.
         clock: plan of the steps.
@@ -42,7 +45,7 @@ class Past:
         """
         n = env.config.n
         self.env, self._hips_ahead = env, env.robot.legs.hips[:, 0]  # m, body frame
-        self.stride, self.lasting, self.lag = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 2))
+        self.stride, self.lasting, self.lag = (np.zeros((n, 3)) for _ in range(3))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
         self.off_hip, self.clock = np.zeros((n, 4)), GaitClock(n, env.size)
         self._age = np.zeros(n)  # s, since the plan has the commanded velocity
@@ -71,7 +74,7 @@ class Past:
         self._age += period * (self.clock.velocity == command[:, :3]).all(axis=1)
         settled = self.settled[:, None]
         self.lasting += (error - self.lasting) * settled * period / LASTING_S
-        self.lag = np.clip(self.lag + error[:, :2] * settled * period, -MAX_LAG_M, MAX_LAG_M)
+        self.lag = np.clip(self.lag + error * settled * period, -MAX_LAG, MAX_LAG)
         for array in (self.lasting, self.lag, self._age):
             array[env.changed] = 0.0
         self._advance_stances()
@@ -87,6 +90,15 @@ class Past:
         self._landed = np.where(contact & ~was_down, ahead, self._landed)
         self.off_hip = np.where(was_down & ~contact, 0.5 * (self._landed + self._last), 0.0)
         self._last = np.where(contact, ahead, self._last)
+
+    @property
+    def turn_correction(self) -> np.ndarray:
+        """Yaw rate that is added to the teacher's command, so that the robot turns as far as commanded.
+
+        Returns:
+            (n,), rad/s.
+        """
+        return np.asarray(CATCH_UP_TURN / self.env.size.time * self.lag[:, 2] * self.clock.walking)
 
     @property
     def settled(self) -> np.ndarray:

@@ -117,8 +117,10 @@ def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
     Returns:
         (n, OBSERVATION_SIZE), scaled to about 1.
     """
-    clock = past.clock.observation().astype(np.float32)
-    return np.concatenate([observe_state(env, past, previous), clock], axis=1)
+    seen = np.concatenate([observe_state(env, past, previous), past.clock.observation()], axis=1)
+    # The teacher is told another yaw rate: the third number of the command, and of the plan.
+    seen[:, [2, -1]] += (past.turn_correction * env.size.time)[:, None]
+    return seen.astype(np.float32)
 
 
 def total_action(env: VelocityEnv, past: Past, correction: np.ndarray) -> np.ndarray:
@@ -132,7 +134,7 @@ def total_action(env: VelocityEnv, past: Past, correction: np.ndarray) -> np.nda
     Returns:
         (n, 12), action in the network's unit, within `ACTION_BOUND`.
     """
-    scripted = joint_offsets(env, past.clock, past.lag) / ACTION_SCALE
+    scripted = joint_offsets(env, past) / ACTION_SCALE
     return np.clip(scripted + correction, -ACTION_BOUND, ACTION_BOUND).astype(np.float32)
 
 

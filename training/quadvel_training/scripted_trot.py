@@ -16,11 +16,11 @@ from quadvel_description.kinematics import foot_positions, inverse_kinematics
 from quadvel_description.quadruped import GRAVITY
 
 from .env import VelocityEnv
-from .gait_clock import GaitClock
+from .past import Past
 
 HEIGHT_M = 0.358  # of the trunk above ground
 CROUCH_M = 0.014  # by which the trunk is lower than in the nominal posture: longer steps are in reach
-LIFT_M = 0.099  # height of a swing
+LIFT_M = 0.09  # height of a swing
 LONGEST_STEP_M = 0.108  # way of a foot under the trunk in one stance
 LEAD_S = 0.05  # joints follow their targets so late, whatever the size
 PLACEMENT_S = np.array([0.103, 0.073])  # x, y: feet are placed this time times the excess velocity out,
@@ -44,20 +44,20 @@ LOAD = 1.51  # share of the load of a stance foot that is fed forward
 LOADING = 0.16  # cycles in which a stance gains or loses load and push, half before touchdown or lift-off
 
 
-def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.ndarray:
+def joint_offsets(env: VelocityEnv, past: Past) -> np.ndarray:
     """Return the joint targets of the scripted trot, relative to those of standing.
 
     Args:
         env: environments.
-        clock: gait clock of their robots.
-        lag: (n, 2), m, integral of the command minus the velocity, forward and left.
+        past: their past, with the gait clock and the way that they lag behind.
 
     Returns:
         (n, 12), rad.
     """
     # All velocities and lengths here are those of a reference robot that moves alike.
-    robot, size = env.robot, env.size
+    robot, size, clock = env.robot, env.size, past.clock
     planned, velocity = size.as_reference(clock.velocity), size.as_reference(env.planar_velocity)
+    planned[:, 2] += past.turn_correction * size.time
     below = foot_positions(robot, robot.nominal_q) / size.length + [0.0, 0.0, CROUCH_M]  # (4, 3), trunk frame
     duty, frequency = clock.duty, clock.frequency * size.time
     ahead = LEAD_S * clock.frequency
@@ -79,7 +79,7 @@ def joint_offsets(env: VelocityEnv, clock: GaitClock, lag: np.ndarray) -> np.nda
     #     - loaded (BEHIND_S clip(v_planned) + DRAG |v_planned| v_planned)
     # A trunk at height h above feet that are a distance d aside accelerates by g d / h. The last
     # term acts in stance alone: joints push the trunk forward, and swings end further ahead.
-    placed = PLACEMENT_S * excess - CATCH_UP * lag / size.length * clock.walking[:, None]
+    placed = PLACEMENT_S * excess - CATCH_UP * past.lag[:, :2] / size.length * clock.walking[:, None]
     placed[:, 1] -= SIDEWAYS_S * planned[:, 1]
     placed -= CURVE * HEIGHT_M / GRAVITY * _turned(planned[:, None, :2], planned[:, 2])[:, 0]
     placed += DOWNHILL * HEIGHT_M * env.ground_slope

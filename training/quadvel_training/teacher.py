@@ -21,7 +21,7 @@ RECALLED_MIRROR = symmetry.concatenate_mirrors(
     [
         privileged.PLANAR,  # error over a stride
         privileged.PLANAR,  # lasting error
-        symmetry.sign_mirror(1, -1),  # lag
+        privileged.PLANAR,  # lag
         symmetry.sign_mirror(-1, -1),  # phase of the steps
         privileged.PLANAR,  # planned velocity
         symmetry.sign_mirror(1, -1),  # slope of the ground
