@@ -191,6 +191,7 @@ LEFT_OUT_KINDS = {
     r"quadvel robot check .*": "the tutorial on other robots runs it; test_found_robot.py has files",
     r"quadvel policy import .*|python -m benchmarks\.imported_walk .*": "test_imported.py has policies",
     r"pixi run .*": "needs pixi and the network",
+    r"mkdir -p out/checkpoints .*": "takes a checkpoint out of the history",
     r"(mkdir -p|cp training/checkpoints).* out/go2/.*": "takes checkpoints to the folders of the runs that follow",
     r"(board|driver|controller|command_mux|ros__parameters):": "a part of a parameter file; test_yaml_examples.py loads it",
     r"(stick_velocity|max_tilt|max_velocity|stamped|imu_mounting): .*": "the same",

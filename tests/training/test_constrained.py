@@ -9,7 +9,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
-from quadvel_training import loop  # noqa: E402
+from quadvel_training import constrained, loop  # noqa: E402
 from quadvel_training.constrained import ConstrainedConfig, ConstrainedRun  # noqa: E402
 from quadvel_training.dagger import DaggerConfig, DaggerRun  # noqa: E402
 from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun  # noqa: E402
@@ -116,3 +116,7 @@ def test_the_policy_file_answers_as_the_network_does(files, tmp_path):
         expected, _ = run.policy()(torch.from_numpy(obs[:, None]), run.policy().initial_state(1))
     found = np.array([policy.step(one).copy() for one in obs])
     assert np.abs(found - expected[:, 0].numpy()).max() < 1e-4
+
+
+def test_the_critic_has_the_inputs_of_the_shipped_checkpoint_so_that_it_can_be_tuned():
+    assert constrained.CRITIC_SIZE == 106  # of training/checkpoints/constrained.pt at ff3dfa6
