@@ -96,7 +96,7 @@ def _written(*paths: Path) -> None:
 
 @app.command("all")
 def train_everything(out: Out = Path("out/training")) -> None:
-    """Train the shipped policy and its estimator from random weights: privileged, dagger, estimator.
+    """Train a policy that trots, and its estimator, from random weights: privileged, dagger, estimator.
 
     Writes DIR/dagger/policy.onnx and DIR/estimator/estimator.onnx. The same command resumes it.
     """

@@ -1,6 +1,6 @@
 """The stages of training as they are run, each in its own folder, where it resumes.
 
-`train_all` runs those that make the shipped files; `train_ablation` and `tune` run stage 3.
+`train_all` runs those that make a policy that trots; `train_ablation` and `tune` run stage 3.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def train_estimator(config: EstimatorConfig, source: Path | None, policy: Path, 
 
 
 def train_all(out: Path) -> bool:
-    """Train the shipped policy and its estimator from random weights, with the recipes of the project.
+    """Train a policy that trots, and its estimator, from random weights, with the recipes of the project.
 
     It resumes where it was stopped.
 
