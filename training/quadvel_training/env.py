@@ -234,6 +234,7 @@ class VelocityEnv:
         foot_position: (n, 4, 3), m.
         foot_velocity: (n, 4, 3), m/s, world frame.
         clearance: (n, 4), m, of each foot above ground.
+        ground_slope: (n, 2), drop of the ground below the feet per metre forward and per metre to the left.
         contact: (n, 4) bool.
         height: (n,), m, of the trunk above ground.
         power: (n,), W, energy term of the paper, mean of the sample.
@@ -439,11 +440,6 @@ class VelocityEnv:
         return self.config.terrain.height(points[..., 0], points[..., 1])
 
     @property
-    def ground_slope(self) -> np.ndarray:
-        """Drop of the ground below the feet per metre forward and per metre to the left, (n, 2)."""
-        return np.stack(self._ground_drop(self._ground(self.feet)), axis=-1)
-
-    @property
     def ground_lean(self) -> np.ndarray:
         """Roll and pitch of a trunk that is parallel to the ground below the feet, (n, 2), rad."""
         forward, left = self.ground_slope.T
@@ -472,7 +468,9 @@ class VelocityEnv:
         joints = self.dq.reshape(-1, 4, 3, 1)
         swing = (jacobians @ joints)[..., 0] + np.cross(self.angular_velocity[:, None], local)
         self.foot_velocity = rotate(quaternion, swing) + qvel[:, None, :3]
-        self.clearance = self.feet[..., 2] - self._ground(self.feet) - self.robot.foot_radius
+        ground = self._ground(self.feet)
+        self.ground_slope = np.stack(self._ground_drop(ground), axis=-1)
+        self.clearance = self.feet[..., 2] - ground - self.robot.foot_radius
         self.contact = self.clearance < 0.001
         self.height = qpos[:, 2] - self._ground(qpos)
         self.fallen = (self.height < FALLEN_HEIGHT_M * self.size.length) | (
