@@ -202,9 +202,9 @@ def test_the_command_writes_the_finding_and_ends_with_1(run: Run, tmp_path: Path
     with pytest.raises(SystemExit) as ended, pytest.warns(UserWarning, match="so --gains is not used"):
         cli.command("why").main(arguments)
     assert ended.value.code == 1
-    told = json.loads((tmp_path / "out" / "why.json").read_text())
-    assert told["finding"]["cause"]
-    assert told["reports_walk"] is False
+    answer = json.loads((tmp_path / "out" / "why.json").read_text())
+    assert answer["finding"]["cause"]
+    assert answer["reports_walk"] is False
     assert (tmp_path / "out" / "why.png").stat().st_size > 1000
 
 

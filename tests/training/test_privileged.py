@@ -200,15 +200,15 @@ def test_on_a_slope_the_trunk_stays_parallel_to_the_ground_and_the_feet_are_plac
     assert moved[:, 2] == pytest.approx(0.0, abs=3e-3)
 
 
-def test_a_robot_that_turned_too_little_is_told_to_turn_faster():
+def test_the_teacher_of_a_robot_that_turned_too_little_gets_a_faster_yaw_rate():
     env = VelocityEnv(CALM)
     env.command[:], past, previous = [0.5, 0.0, 1.0, 0.0], Past(env), np.zeros((4, 12))
     past.clock.walking[:], past.clock.velocity[:] = True, [0.5, 0.0, 1.0]
     usual = privileged.observe(env, past, previous)
     past.lag[1:, 2] = 0.1  # rad
-    told = privileged.observe(env, past, previous) - usual
-    assert told[1:, [2, -1]] == pytest.approx(0.1 * CATCH_UP_TURN)  # command and plan
-    assert not told[0].any()
+    added = privileged.observe(env, past, previous) - usual
+    assert added[1:, [2, -1]] == pytest.approx(0.1 * CATCH_UP_TURN)  # command and plan
+    assert not added[0].any()
     past.clock.walking[:] = False
     assert not past.turn_correction.any()
 

@@ -13,9 +13,7 @@ from .gait_clock import GaitClock
 STRIDE_S = 0.35  # time constant of stride errors: about a stride
 LASTING_S = 1.5  # time constant of lasting errors
 MAX_LAG = 0.4  # m, m, rad: a robot that does not follow is not to make up for more later
-CATCH_UP_TURN = (
-    2.0  # 1/s: a teacher is told to turn faster by this times the angle that the robot lags behind
-)
+CATCH_UP_TURN = 2.0  # 1/s: this times the angle that a robot lags behind is added to its teacher's yaw rate
 TRANSIENT_S = 1.0  # after the plan has reached a command, not part of lasting errors and scores
 STANDING_S = 0.2  # on four feet; after that, setting off means choosing a side
 

@@ -118,7 +118,7 @@ def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
         (n, OBSERVATION_SIZE), scaled to about 1.
     """
     seen = np.concatenate([observe_state(env, past, previous), past.clock.observation()], axis=1)
-    # The teacher is told another yaw rate: the third number of the command, and of the plan.
+    # Correct the yaw rate: the third number of the command, and the last of the plan.
     seen[:, [2, -1]] += (past.turn_correction * env.size.time)[:, None]
     return seen.astype(np.float32)
 

@@ -29,9 +29,7 @@ BEHIND_S = np.array([0.092, 0.037])  # targets of stance feet are this time time
 DRAG = np.array([0.0105, 0.0])  # s^2/m, and this times its square: joints push the trunk forward
 MAX_BEHIND = np.array([0.46, 2.0])  # m/s, planned velocity that counts
 MAX_EXCESS = 0.5  # m/s, excess velocity that counts
-SIDEWAYS_S = (
-    0.07  # feet are placed this time times the planned sideways velocity behind: a sideways trot is slow
-)
+SIDEWAYS_S = 0.07  # feet are placed this time times the planned sideways velocity behind
 CURVE = 1.6  # feet are placed out by this multiple of what the acceleration in a curve takes
 DOWNHILL = 0.8  # share of the way from below the hips to below the trunk on a slope by which feet are placed
 TURN_S = 0.064  # feet are turned about the trunk by this time times the excess yaw rate

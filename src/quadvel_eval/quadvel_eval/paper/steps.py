@@ -18,8 +18,8 @@ from ..walk import Setup, make_loop, record_until_fall
 from .cells import Command
 from .section import Job, JobResults, Record, Row, Section, Study, by_policy, column, distinct, mean, select
 
-SEMI_AXES = np.array([4.5, 2.0, 4.0])  # m/s, m/s, rad/s: ellipsoid of the paper's commands (Section 3.2)
-STANCE_SHARE = 0.2  # of the commands
+SEMI_AXES = np.array([4.5, 2.0, 4.0])  # m/s, m/s, rad/s: ellipsoid of the paper's commands (Section 3.4)
+STANCE_SHARE = 0.2  # of the commands, to stand
 HOLD_S = (2.0, 10.0)  # from and to, until the next command
 
 
