@@ -15,6 +15,8 @@ LASTING_S = 1.5  # time constant of lasting errors
 MAX_LAG = 0.4  # m, m, rad: a robot that does not follow is not to make up for more later
 CATCH_UP_TURN = 2.0  # 1/s: this times the angle that a robot lags behind is added to its teacher's yaw rate
 TRANSIENT_S = 1.0  # after the plan has reached a command, not part of lasting errors and scores
+CRUISE_S = 0.5  # time constant with which a velocity that the plan has reached counts as lasting,
+CRUISE_END_S = 0.1  # and with which it ceases to under a new command
 STANDING_S = 0.2  # on four feet; after that, setting off means choosing a side
 
 
@@ -31,6 +33,8 @@ class Past:
         air: (n, 4), s since the foot left the ground; 0 on the ground.
         down: (n, 4), s since the foot touched the ground; 0 in the air.
         clock: plan of the steps.
+        cruise: (n, 3), planned velocity that lasts: 0 after a new command, it grows over `CRUISE_S`
+            to the command once the plan has reached it.
         off_hip: (n, 4), m, body frame: of a foot that has just left the ground, how far ahead of
             its hip the middle of its stance was; else 0.
     """
@@ -46,6 +50,7 @@ class Past:
         self.stride, self.lasting, self.lag = (np.zeros((n, 3)) for _ in range(3))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
         self.off_hip, self.clock = np.zeros((n, 4)), GaitClock(n, env.size)
+        self.cruise = np.zeros((n, 3))
         self._age = np.zeros(n)  # s, since the plan has the commanded velocity
         self._landed, self._last = np.zeros((n, 4)), np.zeros((n, 4))  # m ahead of the hip: at touchdown, now
 
@@ -55,7 +60,16 @@ class Past:
         Args:
             ids: their indices.
         """
-        for array in (self.stride, self.lasting, self.lag, self.air, self.down, self.off_hip, self._age):
+        for array in (
+            self.stride,
+            self.lasting,
+            self.lag,
+            self.air,
+            self.down,
+            self.off_hip,
+            self._age,
+            self.cruise,
+        ):
             array[ids] = 0.0
         self.clock.reset(ids)
 
@@ -69,7 +83,10 @@ class Past:
         # First-order low-pass filters: x <- x + (e - x) dt / T
         error = velocity_error(env, command)
         self.stride += (error - self.stride) * period / STRIDE_S
-        self._age += period * (self.clock.velocity == command[:, :3]).all(axis=1)
+        reached = (self.clock.velocity == command[:, :3]).all(axis=1)[:, None]
+        self._age += period * reached[:, 0]
+        taking = np.where(reached, CRUISE_S, CRUISE_END_S) * env.size.time
+        self.cruise += (self.clock.velocity * reached - self.cruise) * period / taking
         settled = self.settled[:, None]
         self.lasting += (error - self.lasting) * settled * period / LASTING_S
         self.lag = np.clip(self.lag + error * settled * period, -MAX_LAG, MAX_LAG)

@@ -29,8 +29,9 @@ BEHIND_S = np.array([0.092, 0.037])  # targets of stance feet are this time time
 DRAG = np.array([0.0105, 0.0])  # s^2/m, and this times its square: joints push the trunk forward
 MAX_BEHIND = np.array([0.46, 2.0])  # m/s, planned velocity that counts
 MAX_EXCESS = 0.5  # m/s, excess velocity that counts
-SIDEWAYS_S = 0.07  # feet are placed this time times the planned sideways velocity behind
-CURVE = 1.6  # feet are placed out by this multiple of what the acceleration in a curve takes
+SIDEWAYS_S = 0.07  # feet are placed this time times a lasting sideways velocity behind,
+CURVE = 1.6  # and in a lasting curve out by this multiple of what its acceleration takes,
+MAX_ASIDE_M = 0.08  # both together by this at most: further out, robots fall when they leave the curve
 DOWNHILL = 0.8  # share of the way from below the hips to below the trunk on a slope by which feet are placed
 TURN_S = 0.064  # feet are turned about the trunk by this time times the excess yaw rate
 MAX_YAW_EXCESS = 1.5  # rad/s, excess yaw rate that counts
@@ -55,6 +56,7 @@ def joint_offsets(env: VelocityEnv, past: Past) -> np.ndarray:
     # All velocities and lengths here are those of a reference robot that moves alike.
     robot, size, clock = env.robot, env.size, past.clock
     planned, velocity = size.as_reference(clock.velocity), size.as_reference(env.planar_velocity)
+    cruise = size.as_reference(past.cruise)
     planned[:, 2] += past.turn_correction * size.time
     below = foot_positions(robot, robot.nominal_q) / size.length + [0.0, 0.0, CROUCH_M]  # (4, 3), trunk frame
     duty, frequency = clock.duty, clock.frequency * size.time
@@ -67,19 +69,20 @@ def joint_offsets(env: VelocityEnv, past: Past) -> np.ndarray:
     turning = np.clip(velocity[:, 2] - planned[:, 2], -MAX_YAW_EXCESS, MAX_YAW_EXCESS)
     # way of a foot at (x, y) in a stance of duty / f: (vx - w y, vy + w x) duty / f, (n, 4, 2), m
     way = (planned[:, None, :2] + _turned(below, planned[:, 2])) * (duty / frequency)[:, None, None]
-    way *= np.minimum(1.0, LONGEST_STEP_M / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
+    way = _bounded(way, LONGEST_STEP_M)
     # place on the way, from 1 to -1 in stance and back in swing: 1 - 2 phase / duty, -cos(pi s)
     along = np.where(down, 1.0 - 2.0 * phases / duty[:, None], -np.cos(np.pi * swing))
     along *= clock.walking[:, None]
     # x_foot = x_nominal + way along / 2 + PLACEMENT_S (v - v_planned) - CATCH_UP lag
-    #     - SIDEWAYS_S v_planned,y - CURVE (h / g) w x v_planned + DOWNHILL h slope
+    #     - bound(SIDEWAYS_S v_cruise,y + CURVE (h / g) w x v_cruise) + DOWNHILL h slope
     #     + TURN_S (w_z - w_planned) x (x_nominal)
     #     - loaded (BEHIND_S clip(v_planned) + DRAG |v_planned| v_planned)
     # A trunk at height h above feet that are a distance d aside accelerates by g d / h. The last
     # term acts in stance alone: joints push the trunk forward, and swings end further ahead.
     placed = PLACEMENT_S * excess - CATCH_UP * past.lag[:, :2] / size.length * clock.walking[:, None]
-    placed[:, 1] -= SIDEWAYS_S * planned[:, 1]
-    placed -= CURVE * HEIGHT_M / GRAVITY * _turned(planned[:, None, :2], planned[:, 2])[:, 0]
+    aside = CURVE * HEIGHT_M / GRAVITY * _turned(cruise[:, None, :2], cruise[:, 2])[:, 0]
+    aside[:, 1] += SIDEWAYS_S * cruise[:, 1]
+    placed -= _bounded(aside, MAX_ASIDE_M)
     placed += DOWNHILL * HEIGHT_M * env.ground_slope
     behind = BEHIND_S * np.clip(planned[:, :2], -MAX_BEHIND, MAX_BEHIND)
     behind = behind + DRAG * np.abs(planned[:, :2]) * planned[:, :2]
@@ -110,6 +113,12 @@ def _load(phases: np.ndarray, duty: np.ndarray) -> np.ndarray:
     left = duty[:, None] - phases
     inside = np.where(left > 0.0, np.minimum(phases, left), -np.minimum(-left, 1.0 - phases))  # cycles
     return np.asarray(np.clip(0.5 + inside / LOADING, 0.0, 1.0))
+
+
+def _bounded(way: np.ndarray, longest: float) -> np.ndarray:
+    """Displacements (..., 2) of the same directions, no longer than a length."""
+    length = np.linalg.norm(way, axis=-1, keepdims=True)
+    return np.asarray(way * np.minimum(1.0, longest / np.maximum(length, 1e-9)))
 
 
 def _turned(feet: np.ndarray, angle: np.ndarray) -> np.ndarray:
