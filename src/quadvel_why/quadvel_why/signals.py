@@ -33,6 +33,7 @@ PARTS: Mapping[str, str] = {
     "torque": "reported joint torques while the drives follow targets",
     "imu": "orientation, gyroscope and accelerometer",
     "robot": "a robot whose kinematics are known",
+    "ground": "feet that carry the robot, shown by torques and IMU of a robot whose kinematics are known",
     "policy": "a walk from its beginning, with modes, velocity estimate and the policy file",
     "estimate": "the velocity estimate",
     "temperature": "motor_status",
@@ -101,6 +102,7 @@ class Signals:
             "torque": run.tau is not None and bool(np.any(run.tau)) and self.torque.is_usable,
             "imu": run.imu is not None,
             "robot": run.is_own,
+            "ground": self.carries_itself,
             "policy": self.policy is not None and self.replay.is_usable,
             "estimate": run.estimate is not None,
             "temperature": run.temperature is not None,
@@ -108,6 +110,13 @@ class Signals:
             "modes": run.modes is not None,
         }
         return frozenset(part for part, there in has.items() if there)
+
+    @cached_property
+    def carries_itself(self) -> bool:
+        """Whether the recording shows that the robot does not hang."""
+        run = self.run
+        shown = run.tau is not None and bool(np.any(run.tau)) and self.torque.is_usable
+        return shown and run.imu is not None and run.is_own and not self.legs.hangs
 
     @cached_property
     def torque(self) -> TorqueModel:

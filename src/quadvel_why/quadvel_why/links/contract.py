@@ -287,7 +287,7 @@ class JointOffset(Cause):
                         found, (size, j, f"{offset:+.3f} rad between the drive's angle and the recorded one")
                     )
         size, j, sentence = found
-        if size < self.least and {"imu", "robot"} <= signals.parts and not signals.legs.hangs:
+        if size < self.least and "ground" in signals.parts:
             tried = best_offset(signals.legs)
             if tried is None:
                 return None if not sentence else Measurement(size)

@@ -120,7 +120,7 @@ class JammedJoint(Cause):
     def measure(self, signals: Signals) -> Measurement | None:
         run = signals.run
         if {"torque", "imu"} <= signals.parts:
-            if signals.legs.hangs:
+            if "ground" not in signals.parts:
                 return None  # whoever moves the joints of a suspended robot need not move them alike
             if signals.legs.plane.angle > WALKED_SLOPE_RAD:
                 return NOTHING  # on such ground sound joints rest for longer, too
