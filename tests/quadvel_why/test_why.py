@@ -136,7 +136,9 @@ def test_a_robot_whose_feet_carry_nothing_hangs_and_is_not_weighed(run: Run) -> 
     assert heavy is not None
     assert heavy.value > 1.0
     hanging = Signals(attrs.evolve(run, tau=0.1 * run.tau), policy)
-    assert diagnose(hanging, causes=[Payload]).skipped == {"payload": f"the recording lacks {PARTS['ground']}"}
+    assert diagnose(hanging, causes=[Payload]).skipped == {
+        "payload": f"the recording lacks {PARTS['ground']}"
+    }
 
 
 def test_a_robot_that_stood_for_a_moment_has_no_weak_drive(run: Run) -> None:

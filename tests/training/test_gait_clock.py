@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_eval.gait_kind import GaitKind  # noqa: E402
 from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E402
-from quadvel_training.gait_clock import START_PHASE, GaitClock, duty_factor, step_frequency  # noqa: E402
+from quadvel_training.gait_clock import ACCELERATION, START_PHASE, GaitClock, duty_factor, step_frequency  # noqa: E402
 from quadvel_training.past import Past  # noqa: E402
 from quadvel_training.privileged import ACTION_SCALE, total_action  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
@@ -61,9 +61,9 @@ def test_diagonal_feet_move_together_and_the_pairs_half_a_cycle_apart():
 def test_the_plan_accelerates_to_the_command_and_its_clock_runs_at_that_frequency():
     clock, phase = GaitClock(1), START_PHASE
     advance(clock, WALK)
-    for cycle in range(2, 13):
+    for cycle in range(2, 18):
         advance(clock, WALK)
-        velocity = min(4.0 * PERIOD * cycle, 1.0)
+        velocity = min(ACCELERATION[0] * PERIOD * cycle, 1.0)
         phase += PERIOD * (2.0 + 0.95 * velocity)
         assert clock.velocity[0] == pytest.approx([velocity, 0.0, 0.0])
     assert clock.phase[0] == pytest.approx(phase % 1.0)
@@ -197,7 +197,9 @@ def test_the_targets_of_the_script_do_not_jump_over_a_cycle(vx):
     clock = GaitClock(n)
     clock.velocity[:], clock.walking[:] = [vx, 0.1, 0.3], True
     clock.phase = np.linspace(0.0, 1.0, n, endpoint=False)
-    still = SimpleNamespace(clock=clock, lag=np.zeros((n, 3)), turn_correction=np.zeros(n))
-    targets = joint_offsets(env, still)
+    past = SimpleNamespace(
+        clock=clock, cruise=clock.velocity, lag=np.zeros((n, 3)), turn_correction=np.zeros(n)
+    )
+    targets = joint_offsets(env, past)
     steps = np.abs(np.diff(targets, axis=0, append=targets[:1]))  # rad in 1/2000 of a cycle
     assert steps.max() < 0.02

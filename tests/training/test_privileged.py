@@ -17,7 +17,16 @@ from quadvel_sim.terrain import Terrain  # noqa: E402
 from quadvel_training import loop, privileged, process_group, scripted_trot  # noqa: E402
 from quadvel_training.command_grid import CELL_WIDTH, INITIAL_REACH, CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import EnvConfig, VelocityEnv  # noqa: E402
-from quadvel_training.past import CATCH_UP_TURN, LASTING_S, MAX_LAG, STANDING_S, TRANSIENT_S, Past  # noqa: E402
+from quadvel_training.past import (  # noqa: E402
+    CATCH_UP_TURN,
+    CRUISE_END_S,
+    CRUISE_S,
+    LASTING_S,
+    MAX_LAG,
+    STANDING_S,
+    TRANSIENT_S,
+    Past,
+)
 from quadvel_training.privileged import (  # noqa: E402
     CommandScorer,
     NumberedCheckpoints,
@@ -286,6 +295,22 @@ def test_an_error_that_lasts_is_that_of_this_command_alone_and_without_its_begin
     env.changed[:] = False
     past.advance(command)
     assert (past.lasting[:, 0] == 0.0).tolist() == [False, True, False, False]
+
+
+def test_a_velocity_counts_as_lasting_once_the_plan_has_reached_it_and_ends_with_a_new_command():
+    env = VelocityEnv(CALM)
+    past, command = Past(env), np.tile([1.0, 0.2, 0.5, 0.0], (4, 1))
+    while (past.clock.velocity != command[:, :3]).any():
+        assert not past.cruise.any()
+        past.advance(command)
+    for _ in range(round(10 * CRUISE_S / env.config.period)):
+        past.advance(command)
+    assert past.cruise == pytest.approx(command[:, :3], rel=1e-3)
+    command[1, 1] = -1.5
+    for _ in range(round(3 * CRUISE_END_S / env.config.period)):
+        past.advance(command)
+    assert (np.abs(past.cruise[1]) < 0.06).all()
+    assert past.cruise[0] == pytest.approx(command[0, :3], rel=1e-3)
 
 
 def test_who_runs_off_rough_ground_has_no_time_left_but_has_not_fallen():

@@ -107,7 +107,7 @@ def test_roll_rate_and_joints_beyond_eight_tenths_of_their_drives_speed_are_fine
     env.fastest[2, 0] = 1e3
     w = WalkingWeights()
     assert terms(env, past)["roll"] == pytest.approx([0.0, -4 * w.roll, -10 * w.roll])
-    assert terms(env, past)["overspeed"] == pytest.approx([0.0, -1.5 * w.overspeed, -5 * w.overspeed])
+    assert terms(env, past)["overspeed"] == pytest.approx([0.0, -1.5 * w.overspeed, -8 * w.overspeed])
 
 
 def test_power_weighs_five_times_as_much_at_rest_and_as_ever_from_1_m_s_on(env, past):

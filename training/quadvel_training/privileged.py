@@ -21,6 +21,7 @@ from quadvel_description import symmetry
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.symmetry import sign_mirror
+from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_sim.terrain import Terrain
 
 from . import loop, process_group
@@ -187,6 +188,7 @@ class PrivilegedConfig:
         actuator: `eam`, `limited`, `rated`, `ideal`, or an actuator file.
         seed: seed of all draws.
         grid: commands.
+        taught: limits within which commands are drawn, m/s, rad/s, m/s^2; None for all open cells.
         terrain: ground.
         randomisation: what varies between robots.
         rewards: weights of the rewards.
@@ -208,6 +210,7 @@ class PrivilegedConfig:
     actuator: str = "eam"
     seed: int = 0
     grid: GridConfig = GridConfig()
+    taught: VelocityCommandLimits | None = None
     terrain: Terrain = Terrain()
     randomisation: Randomisation = Randomisation()
     rewards: WalkingWeights = WalkingWeights()
@@ -293,6 +296,8 @@ class PrivilegedRun:
         self.config = c = attrs.evolve(config, n=process_group.local_share(config.n))
         torch.manual_seed(c.seed)
         self.grid = CommandGrid(c.grid)
+        if c.taught:
+            self.grid.narrow(c.taught)
         robot = load_robot(c.robot)
         env_config = EnvConfig(
             robot=robot,

@@ -17,7 +17,8 @@ SAMPLE_S = 0.02  # how long the teacher holds an action
 MIN_REWARD, MAX_REWARD = -6.0, 4.0  # bounds of a sample's sum of terms, without falls
 TARGET_HEIGHT_M = 0.36  # of the trunk; of a robot of the reference size, as the next one (`similarity`)
 SWING_CLEARANCE_M = 0.06  # wanted clearance in swing
-OVERSPEED_SHARE = 0.8  # of a joint's speed limit; `overspeed` penalises more
+OVERSPEED_SHARE = 0.8  # of a joint's speed limit; `overspeed` penalises more,
+MAX_BEYOND = 8.0  # rad/s, up to this excess
 
 
 def error_magnitudes(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -117,7 +118,7 @@ class WalkingWeights:
     off_hip: float = 4.0
     sway: float = 10.0
     roll: float = 0.1
-    overspeed: float = 0.3
+    overspeed: float = 1.0
     slow: float = 5.0
     hips: float = 1.0
     posture: float = 0.2
@@ -254,7 +255,7 @@ class WalkingRewards:
             "off_hip": -w.off_hip * np.abs(past.off_hip).sum(axis=1),
             "sway": -w.sway * np.minimum(sideways**2, 0.1),
             "roll": -w.roll * np.minimum(env.angular_velocity[:, 0] ** 2, 10.0),
-            "overspeed": -w.overspeed * np.minimum(beyond, 5.0).sum(axis=1),
+            "overspeed": -w.overspeed * np.minimum(beyond, MAX_BEYOND).sum(axis=1),
         }
 
     def _stance(self) -> dict[str, np.ndarray]:
