@@ -183,7 +183,7 @@ class EnvConfig:
     )
     randomisation: Randomisation = Randomisation()
     commands: CommandRange = CommandRange()
-    ramped: float = 0.6
+    ramped: float = 0.3
     reversed: float = 0.0
     terrain: Terrain = Terrain()
 

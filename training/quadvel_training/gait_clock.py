@@ -25,7 +25,7 @@ START_PHASE = 0.6  # cycles since touchdown of the pair FR and RL in stance: it 
 CORRECTION = 0.25  # of a touchdown's phase error; the two feet of a pair correct half of it
 SHORTEST_SWING_S = 0.06  # a foot that was in the air for less has not stepped
 YAW_RADIUS_M = 0.3  # yaw rate times this counts as speed of the feet
-ACCELERATION = np.array([3.0, 2.0, 18.0])  # m/s^2, m/s^2, rad/s^2, of the planned velocity
+ACCELERATION = np.array([2.5, 1.75, 18.0])  # m/s^2, m/s^2, rad/s^2, of the planned velocity
 REST_SPEED = 0.2  # m/s; a slower trunk may stop on four feet
 PUSHED_SPEED = 0.4  # m/s; a standing robot whose trunk is faster steps
 
