@@ -12,8 +12,10 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 from quadvel_policy.observation import VelocityCommandLimits  # noqa: E402
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import dagger, loop, privileged, teacher  # noqa: E402
+from quadvel_training.__main__ import app  # noqa: E402
 from quadvel_training.dagger import DaggerConfig, DaggerRun  # noqa: E402
 from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun  # noqa: E402
+from quadvel_training.random_walks import RandomCommands  # noqa: E402
 from tests.helpers.robots import ALIENGO  # noqa: E402
 
 SMALL = DaggerConfig(n=8, threads=1, length=6, mini_batches=2, learning_rate=3e-3)
@@ -244,3 +246,26 @@ def test_every_second_robot_does_not_explore(run):
     run.collect()
     assert not run._noise[::2].any()
     assert run._noise[1::2].any(axis=1).all()
+
+
+def test_random_walks_count_those_who_fall_or_move_a_joint_too_fast(teacher_file, tmp_path, capsys):
+    common = ["random-walks", "--teacher", str(teacher_file), "--robots", "4", "--seconds", "1.5"]
+    app(common, standalone_mode=False)
+    assert "4 robots: 0 fell, 0 fell or" in capsys.readouterr().out
+    run = DaggerRun(SMALL, teacher_file)
+    with torch.no_grad():
+        list(run.average.parameters())[-1][:] = torch.tensor(
+            [0.0, 5.0, -5.0] * 4
+        )  # bias of the joint targets
+    loop.save(run.state(), tmp_path / "dagger.pt")
+    app([*common, "--policy", str(tmp_path / "dagger.pt")], standalone_mode=False)
+    assert "4 robots: 4 fell, 4 fell or" in capsys.readouterr().out
+
+
+def test_random_commands_stay_within_the_limits_of_the_policy():
+    limits = VelocityCommandLimits((-1.0, -0.5, -2.0), (2.0, 0.5, 2.0), curve=2.0)
+    commands = RandomCommands(limits).draw(np.random.default_rng(0), 500)
+    clamped = np.array([limits.clamp(one) for one in commands[:, :3].tolist()])
+    assert clamped == pytest.approx(commands[:, :3])
+    assert 0.1 < commands[:, 3].mean() < 0.3
+    assert (commands[:, :3].any(axis=1) == (commands[:, 3] == 0.0)).all()

@@ -44,6 +44,7 @@ from . import (
     loop,
     privileged,
     process_group,
+    random_walks,
     recipe,
     run_folder,
     stages,
@@ -129,6 +130,28 @@ def walk_teacher(
     config = recipe.read_recipe(privileged.PrivilegedConfig, source)
     for one in teacher_walks.walk_drawn_robots(teacher, config, robots):
         print(one.line, flush=True)
+
+
+@app.command("random-walks")
+def walk_randomly(
+    teacher: TeacherFile = TEACHER,
+    policy: Annotated[
+        Path | None,
+        typer.Option(help="Checkpoint of `dagger`, which drives instead of the teacher.", exists=True),
+    ] = None,
+    source: Recipe = stages.RECIPES / "dagger.yaml",
+    robots: Annotated[int, typer.Option(min=1, help="Number of nominal robots.")] = 192,
+    seconds: Annotated[float, typer.Option(min=1.0, help="Duration of each walk, s.")] = 20.0,
+) -> None:
+    """Let robots walk under the paper's random commands in raw steps, within the limits of a policy file.
+
+    Prints how many fall, and how many fall or move a joint so fast that the supervisor stops them.
+    """
+    config = recipe.read_recipe(dagger.DaggerConfig, source)
+    found = random_walks.walk_randomly(teacher, policy, config, robots, seconds)
+    typer.echo(
+        f"{found.robots} robots: {found.fell} fell, {found.stopped} fell or moved a joint beyond the supervisor's limit"
+    )
 
 
 @app.command("dagger")

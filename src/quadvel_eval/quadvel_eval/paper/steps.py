@@ -13,6 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from typing_extensions import override
 
+from quadvel_description.arrays import Array
+
 from ..robot_loop import CONTROL_PERIOD_S
 from ..walk import Setup, make_loop, record_until_fall
 from .cells import Command
@@ -23,8 +25,24 @@ STANCE_SHARE = 0.2  # of the commands, to stand
 HOLD_S = (2.0, 10.0)  # from and to, until the next command
 
 
+def draw_velocities(rng: np.random.Generator, n: int) -> Array:
+    """Draw velocities, uniformly from the ellipsoid, some of them 0.
+
+    Args:
+        rng: Source of randomness.
+        n: Number of velocities.
+
+    Returns:
+        vx, vy (m/s), wz (rad/s), (n, 3).
+    """
+    direction = rng.normal(size=(n, 3))
+    # uniform in a unit ball: r = u^(1/3)
+    unit = direction / np.linalg.norm(direction, axis=1, keepdims=True) * np.cbrt(rng.random((n, 1)))
+    return np.asarray(SEMI_AXES * unit * (rng.random((n, 1)) >= STANCE_SHARE))
+
+
 def draw_commands(seed: int, seconds: float) -> list[tuple[Command, float]]:
-    """Draw the commands of an episode, uniformly from the ellipsoid.
+    """Draw the commands of an episode.
 
     Args:
         seed: Seed of the draws.
@@ -36,10 +54,7 @@ def draw_commands(seed: int, seconds: float) -> list[tuple[Command, float]]:
     rng = np.random.default_rng(seed)
     commands: list[tuple[Command, float]] = []
     while seconds > 0.0:
-        direction = rng.normal(size=3)
-        # uniform in a unit ball: r = u^(1/3)
-        unit = direction / np.linalg.norm(direction) * np.cbrt(rng.random())
-        vx, vy, wz = (SEMI_AXES * unit * (rng.random() >= STANCE_SHARE)).tolist()
+        vx, vy, wz = draw_velocities(rng, 1)[0].tolist()
         hold = min(rng.uniform(*HOLD_S), seconds)
         commands.append(((vx, vy, wz), hold))
         seconds -= hold
