@@ -13,8 +13,8 @@ pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-
 from quadvel_training import closing
 
 
-def given(out: Path) -> tuple[str, Path, Path, float, Path]:
-    return "3 ms more delay", Path("policy.onnx"), Path("constrained.pt"), 2.0, out
+def given(out: Path) -> tuple[str, Path, Path, Path, float, Path]:
+    return "3 ms more delay", Path("policy.onnx"), Path("dagger.pt"), Path("privileged.pt"), 2.0, out
 
 
 def test_steps_whose_files_are_there_are_not_run_again(tmp_path, monkeypatch, capsys):

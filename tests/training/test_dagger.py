@@ -242,6 +242,20 @@ def test_a_killed_run_resumes(run, teacher_file, tmp_path):
         assert torch.equal(one, two)
 
 
+def test_tuning_starts_from_the_weights_of_the_policy_file_and_counts_its_own_samples(
+    run, teacher_file, tmp_path
+):
+    run.step(0.0)
+    loop.save(run.state(), tmp_path / "dagger.pt")
+    tuned = DaggerRun(SMALL, teacher_file)
+    tuned.start_from(tmp_path / "dagger.pt")
+    for name, value in tuned.student.state_dict().items():
+        assert value.equal(run.average.state_dict()[name])
+    assert tuned.samples == 0
+    with pytest.raises(loop.CheckpointError, match="expected a checkpoint of `dagger`"):
+        tuned.start_from(teacher_file)
+
+
 def test_every_second_robot_does_not_explore(run):
     run.collect()
     assert not run._noise[::2].any()

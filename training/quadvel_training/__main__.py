@@ -55,7 +55,7 @@ from .card import card
 app = typer.Typer(
     no_args_is_help=True,
     help="Train quadvel's policy and estimator. `all` runs the stages in order: privileged, dagger, estimator; "
-    "`ablation` and `tune` run constrained, on a policy that walks. Ctrl-C saves; the same command resumes. "
+    "`ablation` runs constrained, on a policy that walks. Ctrl-C saves; the same command resumes. "
     "torchrun trains in several processes, on several machines if these share the directory: "
     "torchrun --nproc-per-node 2 -m -- quadvel_training all",
 )
@@ -230,20 +230,22 @@ def tune_policy(
         Path,
         typer.Option(help="Actuator file of `quadvel identify`.", exists=True, callback=_actuator_file),
     ],
-    policy: PolicyCheckpoint = STUDENT,
+    policy: Annotated[Path, typer.Option(help="Checkpoint of `dagger`, of the policy.")] = STUDENT,
+    teacher: TeacherFile = TEACHER,
     minutes: Annotated[
         float, typer.Option(min=0.1, help="Duration, minutes; starts again when resumed.")
     ] = 20.0,
     out: Out = Path("out/tuned"),
-    device: Device = "cpu",
 ) -> None:
     """Tune a policy on a corrected actuator model for a short time; writes DIR/policy.onnx.
+
+    It imitates its teacher on these actuators, as in stage 2.
 
     \b
     Compare before and after on the plants of the gap:
       quadvel paper --out out/gap --only gap --policy before=BEFORE.onnx --policy after=DIR/policy.onnx
     """
-    _written(stages.tune(actuator, policy, minutes, out, device))
+    _written(stages.tune(actuator, policy, teacher, minutes, out))
 
 
 Plant = Annotated[
@@ -270,8 +272,9 @@ def record_log(
 @app.command("close-the-loop")
 def close_the_loop(
     checkpoint: Annotated[
-        Path, typer.Option(help="Checkpoint of `constrained` that POLICY was written from.", exists=True)
+        Path, typer.Option(help="Checkpoint of `dagger` that POLICY was written from.", exists=True)
     ],
+    teacher: Annotated[Path, typer.Option(help="Checkpoint of `privileged`, its teacher.", exists=True)],
     plant: Plant = "friction",
     policy: WalkingPolicy = SHIPPED_POLICY,
     minutes: Annotated[float, typer.Option(min=0.1, help="Duration of the tuning, minutes.")] = 20.0,
@@ -282,7 +285,7 @@ def close_the_loop(
     Runs `record`, `quadvel identify`, `tune` and `quadvel paper --only gap`; existing files are kept.
     """
     try:
-        _written(closing.close_the_loop(plant, policy, checkpoint, minutes, out))
+        _written(closing.close_the_loop(plant, policy, checkpoint, teacher, minutes, out))
     except subprocess.CalledProcessError as error:
         raise typer.Exit(error.returncode) from None
 

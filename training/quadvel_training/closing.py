@@ -19,7 +19,7 @@ STEPS = (  # file that a step writes, and arguments of python
     (
         "{out}/tuned/policy.onnx",
         "-m torch.distributed.run --standalone --nproc-per-node={cores} -m -- quadvel_training tune "
-        "--actuator {out}/identified/actuator.yaml --policy {checkpoint} --minutes {minutes} --out {out}/tuned",
+        "--actuator {out}/identified/actuator.yaml --policy {checkpoint} --teacher {teacher} --minutes {minutes} --out {out}/tuned",
     ),
     (
         "{out}/gap/README.md",
@@ -29,22 +29,23 @@ STEPS = (  # file that a step writes, and arguments of python
 
 
 def fill_steps(
-    plant: str, policy: Path, checkpoint: Path, minutes: float, out: Path
+    plant: str, policy: Path, checkpoint: Path, teacher: Path, minutes: float, out: Path
 ) -> list[tuple[Path, list[str]]]:
     """Fill `STEPS` in.
 
     Args:
         plant: plant of the gap.
         policy: policy file that was written from `checkpoint`.
-        checkpoint: checkpoint of `constrained`.
+        checkpoint: checkpoint of `dagger`.
+        teacher: checkpoint of `privileged`, its teacher.
         minutes: time for which the policy is tuned, minutes.
         out: folder of the results.
 
     Returns:
         For each step, the file that it ends with and the arguments of python.
     """
-    known = {"plant": plant, "policy": policy, "checkpoint": checkpoint, "minutes": minutes, "out": out}
-    known["cores"] = available_cores()
+    known = {"plant": plant, "policy": policy, "checkpoint": checkpoint, "teacher": teacher, "out": out}
+    known |= {"minutes": minutes, "cores": available_cores()}
     filled = [(file.format(**known), command) for file, command in STEPS]
     return [
         (Path(file), [word.format(file=file, **known) for word in command.split()])
@@ -52,13 +53,16 @@ def fill_steps(
     ]
 
 
-def close_the_loop(plant: str, policy: Path, checkpoint: Path, minutes: float, out: Path) -> Path:
+def close_the_loop(
+    plant: str, policy: Path, checkpoint: Path, teacher: Path, minutes: float, out: Path
+) -> Path:
     """Run the steps whose files are missing; each command is printed before it runs.
 
     Args:
         plant: plant of the gap.
         policy: policy file that was written from `checkpoint`.
-        checkpoint: checkpoint of `constrained`.
+        checkpoint: checkpoint of `dagger`.
+        teacher: checkpoint of `privileged`, its teacher.
         minutes: time for which the policy is tuned, minutes.
         out: folder of the results.
 
@@ -69,7 +73,7 @@ def close_the_loop(plant: str, policy: Path, checkpoint: Path, minutes: float, o
         subprocess.CalledProcessError: a command failed.
     """
     out.mkdir(parents=True, exist_ok=True)
-    for file, arguments in (all_of_them := fill_steps(plant, policy, checkpoint, minutes, out)):
+    for file, arguments in (all_of_them := fill_steps(plant, policy, checkpoint, teacher, minutes, out)):
         if file.exists():
             print(f"kept: {file}", flush=True)
         else:

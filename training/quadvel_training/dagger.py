@@ -231,6 +231,23 @@ class DaggerRun:
         process_group.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
 
+    def start_from(self, checkpoint: Path) -> None:
+        """Take over the weights of another run.
+
+        Args:
+            checkpoint: checkpoint of this stage.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            CheckpointError: it is one of another stage.
+        """
+        state = load(checkpoint)
+        if "recall" not in state:
+            raise CheckpointError(f"{checkpoint}: expected a checkpoint of `dagger`")
+        self.student.load_state_dict(state["average"])
+        self.average.load_state_dict(state["average"])
+        self.recall.load_state_dict(state["recall"])
+
     def _learning(self) -> torch.nn.ModuleList:
         """Networks that learn."""
         return torch.nn.ModuleList([self.student, self.recall])

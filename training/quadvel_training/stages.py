@@ -1,6 +1,7 @@
 """The stages of training as they are run, each in its own folder, where it resumes.
 
-`train_all` runs those that make a policy that trots; `train_ablation` and `tune` run stage 3.
+`train_all` runs those that make the shipped files, `train_ablation` runs stage 3, and `tune` stage 2 on
+other actuators.
 """
 
 from __future__ import annotations
@@ -48,7 +49,9 @@ def train_teacher(config: PrivilegedConfig, source: Path | None, folder: Path) -
     return loop.train(run, config.budget, folder / TEACHER, WalkLog(run, folder))
 
 
-def train_student(config: DaggerConfig, source: Path | None, teacher: Path, folder: Path) -> bool:
+def train_student(
+    config: DaggerConfig, source: Path | None, teacher: Path, folder: Path, start: Path | None = None
+) -> bool:
     """Run stage 2, and write the policy file, also after an interruption.
 
     Args:
@@ -56,11 +59,14 @@ def train_student(config: DaggerConfig, source: Path | None, teacher: Path, fold
         source: recipe file, for the record.
         teacher: checkpoint of stage 1.
         folder: run directory.
+        start: checkpoint of stage 2 whose weights a new run starts from; None for random ones.
 
     Returns:
         Whether the budget is spent.
     """
     run, checkpoint = DaggerRun(config, teacher), folder / STUDENT
+    if start is not None:
+        run.start_from(start)
     write_run_file(folder, "dagger", source, config)
     spent = loop.train(run, config.budget, checkpoint)
     if process_group.rank() == 0:
@@ -188,20 +194,20 @@ def scale_budget(config: ConstrainedConfig, samples: float) -> ConstrainedConfig
     )
 
 
-def tune(drives: Path, start: Path, minutes: float, out: Path, device: str) -> Path:
-    """Tune a policy on the actuators of a file, for a short while.
+def tune(drives: Path, start: Path, teacher: Path, minutes: float, out: Path) -> Path:
+    """Let a policy imitate its teacher on the actuators of a file, for a short while.
 
     Args:
         drives: actuator file.
-        start: checkpoint of stage 3 or 2.
+        start: checkpoint of stage 2.
+        teacher: checkpoint of stage 1.
         minutes: duration.
         out: run directory.
-        device: `cpu` or `cuda`.
 
     Returns:
         The policy file, written also after an interruption.
     """
-    config, source = _recipe(ConstrainedConfig, "tune")
+    config, source = _recipe(DaggerConfig, "tune")
     budget = attrs.evolve(config.budget, minutes=minutes)
-    train_policy(attrs.evolve(config, actuator=str(drives), budget=budget), source, start, None, out, device)
+    train_student(attrs.evolve(config, actuator=str(drives), budget=budget), source, teacher, out, start)
     return out / POLICY_FILE
