@@ -42,9 +42,9 @@ def test_a_policys_card_names_its_figures_and_where_it_fails(evaluation):
     text, metadata = card(SHIPPED_POLICY, [evaluation]), PolicyFile(ALIENGO).metadata
     low, high = metadata.command_limits["vx"]
     for said in (
-        f"| samples | {metadata.recipe['samples']} |",
+        f"| samples | {metadata.recipe['samples']:,} |",
         "| largest error, m/s | 0.11 |",
-        "aliengo, limited: ΔKp -0.706 N m/rad",
+        "aliengo: ΔKp -0.706 N m/rad",
         f"Commands beyond vx {low:g} to {high:g} m/s",
         "fell in 1 of 3 runs, at commands (vx, vy, wz) (-1, 0.4, 0)",
         "furthest off at the command (1.5, 0, -1), 0.110 m/s",
