@@ -86,7 +86,7 @@ def test_some_metres_down_the_corridor_behind_a_person(tmp_path: Path) -> None:
     assert not found["fell"]
     assert found["touched"] == {}
     assert found["least_clearance"] > 0.3
-    assert found["error_xy"] < 0.15
+    assert found["error_xy"] < 0.2  # most of it while the robot sets off
     assert (tmp_path / "tour.png").stat().st_size > 10_000
 
 

@@ -171,7 +171,8 @@ def test_the_mirrored_robot_observes_the_mirror_image():
 def walking_feet(env: VelocityEnv, planned: list[float], lag: list[float]) -> np.ndarray:
     """Feet (4, 3) of the scripted trot of a robot that moves as planned."""
     past = Past(env)
-    past.clock.walking[:], past.clock.velocity[:], past.lag[:, : len(lag)] = True, planned, lag
+    past.clock.walking[:], past.lag[:, : len(lag)] = True, lag
+    past.clock.velocity[:] = past.cruise[:] = planned
     env.velocity[:, :2], env.angular_velocity[:] = planned[:2], [0.0, 0.0, planned[2]]
     offsets = joint_offsets(env, past)
     return foot_positions(ALIENGO, ALIENGO.nominal_q + offsets[0])
