@@ -147,6 +147,21 @@ class Commands(Protocol):
         ...
 
 
+class NeverReversed:
+    """Base of sources whose commands are not to be reversed."""
+
+    def contains(self, command: np.ndarray) -> np.ndarray:
+        """Whether velocities may be drawn; none, as no command is to be reversed.
+
+        Args:
+            command: (n, 3), m/s, m/s, rad/s.
+
+        Returns:
+            (n,) bool.
+        """
+        return np.zeros(len(command), bool)
+
+
 @attrs.frozen
 class EnvConfig:
     """Configuration of a batch of environments.

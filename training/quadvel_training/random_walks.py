@@ -19,14 +19,14 @@ from quadvel_policy.guard import GuardConfig
 from quadvel_policy.observation import VelocityCommandLimits
 
 from .dagger import DaggerConfig, action_map, load_policy, observe
-from .env import TICK_S, EnvConfig, VelocityEnv
+from .env import TICK_S, EnvConfig, NeverReversed, VelocityEnv
 from .loop import load
 from .randomisation import Randomisation, load_actuator
 from .teacher import Teacher
 
 
 @attrs.frozen
-class RandomCommands:
+class RandomCommands(NeverReversed):
     """Commands of the paper's training, held to the limits of a policy.
 
     Attributes:
@@ -49,17 +49,6 @@ class RandomCommands:
         """
         velocity = np.array([self.limits.clamp(one) for one in draw_velocities(rng, n).tolist()])
         return np.column_stack([velocity, ~velocity.any(axis=1)])
-
-    def contains(self, command: np.ndarray) -> np.ndarray:
-        """Whether velocities may be drawn; none, as no command is to be reversed.
-
-        Args:
-            command: (n, 3), m/s, m/s, rad/s.
-
-        Returns:
-            (n,) bool.
-        """
-        return np.zeros(len(command), bool)
 
 
 @attrs.frozen

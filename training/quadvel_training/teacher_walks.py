@@ -17,7 +17,7 @@ from typing_extensions import override
 from quadvel_description.robot import load_robot
 from quadvel_eval.gait_kind import GaitKind
 
-from .env import EnvConfig, VelocityEnv
+from .env import EnvConfig, NeverReversed, VelocityEnv
 from .loop import load
 from .networks import Gaussian
 from .past import Past
@@ -46,7 +46,7 @@ RAMPED = 0.7  # share of the robots whose command ramps from rest
 
 
 @attrs.frozen
-class ConstantCommands:
+class ConstantCommands(NeverReversed):
     """Commands that never change, of the robots in their order.
 
     Attributes:
@@ -68,17 +68,6 @@ class ConstantCommands:
             (n, 4): vx, vy (m/s), yaw rate (rad/s), 0 as they walk.
         """
         return np.concatenate([self.velocities, np.zeros((n, 1))], axis=1)
-
-    def contains(self, command: np.ndarray) -> np.ndarray:
-        """Whether velocities may be drawn; none, as no command is to be reversed.
-
-        Args:
-            command: (n, 3), m/s, m/s, rad/s.
-
-        Returns:
-            (n,) bool.
-        """
-        return np.zeros(len(command), bool)
 
 
 @attrs.frozen

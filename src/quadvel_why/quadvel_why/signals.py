@@ -102,21 +102,14 @@ class Signals:
             "torque": run.tau is not None and bool(np.any(run.tau)) and self.torque.is_usable,
             "imu": run.imu is not None,
             "robot": run.is_own,
-            "ground": self.carries_itself,
             "policy": self.policy is not None and self.replay.is_usable,
             "estimate": run.estimate is not None,
             "temperature": run.temperature is not None,
             "command": run.velocity_command is not None and self.policy is not None,
             "modes": run.modes is not None,
         }
+        has["ground"] = has["torque"] and has["imu"] and has["robot"] and not self.legs.hangs
         return frozenset(part for part, there in has.items() if there)
-
-    @cached_property
-    def carries_itself(self) -> bool:
-        """Whether the recording shows that the robot does not hang."""
-        run = self.run
-        shown = run.tau is not None and bool(np.any(run.tau)) and self.torque.is_usable
-        return shown and run.imu is not None and run.is_own and not self.legs.hangs
 
     @cached_property
     def torque(self) -> TorqueModel:

@@ -11,7 +11,7 @@ from quadvel_description.arrays import Array
 from quadvel_description.quadruped import GRAVITY
 
 from ..cause import Cause, Link, Measurement, Trace, worst_span
-from ..legs import WALKED_SLOPE_RAD, Legs
+from ..legs import HELD_SHARE, WALKED_SLOPE_RAD, Legs
 from ..signals import Signals
 
 LOADED_N = 60.0
@@ -142,6 +142,8 @@ class Payload(Cause):
         total = legs.force[..., 2].sum(axis=1)
         own = signals.run.robot.mass
         mass = float(total[rows].mean()) / GRAVITY / FOUND_MASS_SHARE - own
+        if mass < -HELD_SHARE * own:
+            return None  # it is held while it walks
         low, high = signals.trained.payload
         beyond = max(mass - high, low - mass, 0.0)
         expected = np.full(len(total), own * GRAVITY * FOUND_MASS_SHARE)
