@@ -210,8 +210,8 @@ def _policy_limits(metadata: Json, found: Sequence[Json]) -> Iterable[str]:
     )
     yield f"Commands beyond {spans} are cut to that."
     if curve := metadata.get("curve_limit"):
-        yield "Together vx and vy are held to the ellipse that these limits span, of which they use the part r."
-        yield f"In curves |wz| is cut to {curve:g} m/s² (1 - r²) / (|vx| + |vy|)."
+        yield "Together vx and vy are held to the ellipse that these limits span; r is the part of it that they use."
+        yield f"In curves |wz| is cut to {curve:g} m/s² √(1 - r²) / v, v the speed."
     yield f"Its gains are part of it: kp {_value_or_range(metadata['kp'])} N m/rad, kd {_value_or_range(metadata['kd'])} N m s/rad."
     for one in found:
         where, stood = _conditions(one["setup"]), [cell for cell in one["cells"] if not cell["fell"]]

@@ -65,7 +65,7 @@ class GridConfig:
     error_wz: float = 0.12
     error_share: float = 0.06
 
-    answered: VelocityCommandLimits = VelocityCommandLimits((-2.2, -1.5, -5.0), (2.6, 1.5, 5.0), curve=1.8)
+    answered: VelocityCommandLimits = VelocityCommandLimits((-2.2, -1.5, -5.0), (2.6, 1.5, 5.0), curve=2.05)
 
     def limits(self) -> VelocityCommandLimits:
         """Return the limits of the grid.

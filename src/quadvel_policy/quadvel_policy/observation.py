@@ -444,16 +444,15 @@ REQUIRED_FIELDS = tuple(field for field in METADATA_FIELDS if field not in ("rob
 class VelocityCommandLimits:
     """Limits of velocity commands (vx, vy, wz), m/s and rad/s; coupled if `curve` is given.
 
-    With `curve`, vx and vy stay in the ellipse of their limits, at the normalised radius r, and
+    With `curve`, velocity and lateral acceleration of a curve stay in one ellipsoid, so the largest
+    turn rate decreases with speed:
 
-        |wz| <= curve (1 - r^2) / (|vx| + |vy|)
-
-    so the largest turn rate decreases with speed.
+        (vx / limit)^2 + (vy / limit)^2 + (v wz / curve)^2 <= 1,  v = hypot(vx, vy)
 
     Attributes:
         low: Lower limits.
         high: Upper limits.
-        curve: Largest lateral acceleration, m/s^2; None for independent limits.
+        curve: Largest lateral acceleration at low speed, m/s^2; None for independent limits.
     """
 
     low: tuple[float, float, float]
@@ -477,7 +476,7 @@ class VelocityCommandLimits:
         out = math.hypot(*(v / end for v, end in zip((vx, vy), ends, strict=True) if v))
         if out > 1.0:
             vx, vy, out = vx / out, vy / out, 1.0
-        turn = self.curve * (1.0 - out**2) / (abs(vx) + abs(vy))
+        turn = self.curve * math.sqrt(1.0 - out**2) / math.hypot(vx, vy)
         return vx, vy, min(max(wz, -turn), turn)
 
 
