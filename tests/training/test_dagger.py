@@ -216,7 +216,7 @@ def test_labels_are_smoothed(run, monkeypatch):
 
 def test_the_student_learns_the_commands_that_are_taught(teacher_file):
     taught = VelocityCommandLimits((-0.3, -0.2, -0.5), (0.4, 0.2, 0.5), 4.0)
-    run = DaggerRun(attrs.evolve(SMALL, taught=taught), teacher_file)
+    run = DaggerRun(attrs.evolve(SMALL, grid=attrs.evolve(SMALL.grid, taught=taught)), teacher_file)
     drawn = run.grid.draw(np.random.default_rng(0), 500)[:, :3]
     assert drawn.min(axis=0) == pytest.approx(taught.low, abs=0.1)
     assert (drawn >= np.array(taught.low) - 1e-9).all()

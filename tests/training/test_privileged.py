@@ -122,14 +122,16 @@ def test_cells_close_again_where_commands_are_followed_no_more(grid):
     assert grid.summary()["forward"] == 1.5
 
 
-def test_a_narrowed_grid_draws_commands_within_the_narrower_limits_alone(grid):
-    narrow = VelocityCommandLimits((-1.2, -0.5, -1.0), (1.4, 0.5, 1.0), curve=1.5)
-    grid.success[:] = 1.0
-    grid.record(np.zeros((0, 4)), np.zeros((0, 2)), np.zeros(0, bool))
-    assert grid.draw(np.random.default_rng(1), 2000)[:, 0].max() > 3.0
-    grid.narrow(narrow)
+def test_a_grid_draws_commands_within_what_is_taught_alone():
+    taught = VelocityCommandLimits((-1.2, -0.5, -1.0), (1.4, 0.5, 1.0), curve=1.5)
+    whole, grid = (CommandGrid(GridConfig(stance=0.0, taught=one)) for one in (None, taught))
+    assert whole.shape == grid.shape
+    for one in (whole, grid):
+        one.success[:] = 1.0
+        one.record(np.zeros((0, 4)), np.zeros((0, 2)), np.zeros(0, bool))
+    assert whole.draw(np.random.default_rng(1), 2000)[:, 0].max() > 3.0
     drawn = grid.draw(np.random.default_rng(1), 2000)[:, :3]
-    assert [narrow.clamp(one) for one in drawn.tolist()] == [pytest.approx(one) for one in drawn.tolist()]
+    assert [taught.clamp(one) for one in drawn.tolist()] == [pytest.approx(one) for one in drawn.tolist()]
     assert np.ptp(drawn, axis=0) == pytest.approx([2.6, 1.0, 2.0], rel=0.05)
     assert not grid.contains(np.array([[2.0, 0.0, 0.0]]))[0]
 

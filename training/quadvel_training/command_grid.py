@@ -46,6 +46,8 @@ class GridConfig:
         error_xy: m/s, mean error up to which a command at rest counts as followed.
         error_wz: rad/s, the same for yaw.
         error_share: increase of both per m/s and rad/s of the command.
+        taught: limits within those of the grid that commands are drawn from, m/s, rad/s, m/s^2; None
+            for those of the grid. The cells, which a checkpoint keeps, do not depend on them.
         answered: commands that a policy file accepts, m/s, rad/s, m/s^2. The grid is larger, so
             that none is at its edge. Within these, joints of the shipped policy stay below 1.1 of
             their drives' speed on the second plant (`quadvel paper`).
@@ -64,7 +66,7 @@ class GridConfig:
     error_xy: float = 0.12
     error_wz: float = 0.12
     error_share: float = 0.06
-
+    taught: VelocityCommandLimits | None = None
     answered: VelocityCommandLimits = VelocityCommandLimits((-2.2, -1.5, -5.0), (2.6, 1.5, 5.0), curve=2.05)
 
     def limits(self) -> VelocityCommandLimits:
@@ -99,8 +101,8 @@ class CommandGrid:
             config: configuration.
         """
         self.config = config
-        self._limits = config.limits()
-        back, ahead = (np.abs(end) / CELL_WIDTH for end in (self._limits.low, self._limits.high))
+        reach, self._limits = config.limits(), config.taught or config.limits()
+        back, ahead = (np.abs(end) / CELL_WIDTH for end in (reach.low, reach.high))
         cells = [np.ceil(np.round(end - 0.5, 6)).astype(int) for end in (back, ahead)]
         self._first = -cells[0]  # index of the lowest cell on each axis; 0 at rest
         self.shape = tuple((cells[0] + cells[1] + 1).tolist())
@@ -110,17 +112,6 @@ class CommandGrid:
         self._near = (np.abs(self._middle) <= np.array(INITIAL_REACH) + 1e-9).all(axis=-1) & self.allowed
         self.success = np.zeros(self.shape)
         self.followed = np.zeros(self.shape, bool)
-        self._open_around_followed()
-
-    def narrow(self, limits: VelocityCommandLimits) -> None:
-        """Draw only commands within narrower limits from now on.
-
-        Args:
-            limits: limits within those of the grid.
-        """
-        self._limits = limits
-        self.allowed &= self._cells_within_limits()
-        self._near &= self.allowed
         self._open_around_followed()
 
     @property

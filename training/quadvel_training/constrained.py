@@ -74,7 +74,6 @@ class ConstrainedConfig:
         timestep: s, of the physics.
         seed: seed of all draws.
         grid: commands; has to match the grid of the student, whose open cells are taken over.
-        taught: limits of the commands that are learned, m/s, rad/s, m/s^2; None for all open cells.
         terrain: ground.
         randomisation: what varies between robots.
         rewards: weights of Table 2.
@@ -103,7 +102,6 @@ class ConstrainedConfig:
     timestep: float = 0.0025
     seed: int = 3
     grid: GridConfig = GridConfig()
-    taught: VelocityCommandLimits | None = None
     terrain: Terrain = Terrain()
     randomisation: Randomisation = Randomisation()
     rewards: RewardWeights = RewardWeights()
@@ -136,8 +134,6 @@ class ConstrainedRun:
         self.grid = CommandGrid(c.grid)
         if "grid" in known:
             self.grid.restore(known["grid"])
-        if c.taught:
-            self.grid.narrow(c.taught)
         robot = load_robot(c.robot)
         env_config = EnvConfig(
             robot=robot,

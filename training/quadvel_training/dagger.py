@@ -89,7 +89,6 @@ class DaggerConfig:
         actuator: `eam`, `limited`, `rated`, `ideal`, or an actuator file.
         seed: seed of all draws.
         grid: commands; has to match the grid of the teacher, whose open cells are taken over.
-        taught: limits of the commands that the student learns, m/s, rad/s, m/s^2; None for all open cells.
         terrain: ground.
         randomisation: what varies between robots.
     """
@@ -114,7 +113,6 @@ class DaggerConfig:
     actuator: str = "eam"
     seed: int = 1
     grid: GridConfig = GridConfig()
-    taught: VelocityCommandLimits | None = None
     terrain: Terrain = Terrain()
     randomisation: Randomisation = Randomisation()
 
@@ -169,8 +167,6 @@ class DaggerRun:
         checkpoint = load(teacher_file)
         self.grid = CommandGrid(c.grid)
         self.grid.restore(checkpoint["grid"])
-        if c.taught:
-            self.grid.narrow(c.taught)
         robot = load_robot(c.robot)
         env_config = EnvConfig(
             robot=robot,

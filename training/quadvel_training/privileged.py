@@ -188,7 +188,6 @@ class PrivilegedConfig:
         actuator: `eam`, `limited`, `rated`, `ideal`, or an actuator file.
         seed: seed of all draws.
         grid: commands.
-        taught: limits within which commands are drawn, m/s, rad/s, m/s^2; None for all open cells.
         terrain: ground.
         randomisation: what varies between robots.
         rewards: weights of the rewards.
@@ -210,7 +209,6 @@ class PrivilegedConfig:
     actuator: str = "eam"
     seed: int = 0
     grid: GridConfig = GridConfig()
-    taught: VelocityCommandLimits | None = None
     terrain: Terrain = Terrain()
     randomisation: Randomisation = Randomisation()
     rewards: WalkingWeights = WalkingWeights()
@@ -296,8 +294,6 @@ class PrivilegedRun:
         self.config = c = attrs.evolve(config, n=process_group.local_share(config.n))
         torch.manual_seed(c.seed)
         self.grid = CommandGrid(c.grid)
-        if c.taught:
-            self.grid.narrow(c.taught)
         robot = load_robot(c.robot)
         env_config = EnvConfig(
             robot=robot,
