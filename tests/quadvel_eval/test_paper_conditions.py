@@ -69,9 +69,9 @@ def test_survival_counts_the_robots_that_did_not_fall() -> None:
 def test_a_robot_that_is_stuck_on_a_slope_fails_there_and_slopes_are_not_pooled() -> None:
     section, command = Slopes(), (1.0, 0.0, 0.0)
     errors = {
-        15: (MAX_FOLLOWING_ERROR + 0.01, MAX_FOLLOWING_ERROR - 0.01, None),
-        7.5: (0.01, 0.02, 0.03),
-        -15: (None, None, 0.02),
+        "15 degrees up": (MAX_FOLLOWING_ERROR + 0.01, MAX_FOLLOWING_ERROR - 0.01, None),
+        "7.5 degrees up": (0.01, 0.02, 0.03),
+        "15 degrees down": (None, None, 0.02),
     }
     records = section.to_records(
         [
@@ -100,7 +100,7 @@ def test_a_robot_that_is_stuck_on_a_slope_fails_there_and_slopes_are_not_pooled(
 
 def test_robots_walk_on_slopes_after_both_starts_on_every_plant() -> None:
     jobs = Slopes().jobs(Study(seeds=1))
-    assert len(jobs) == 2 * 3 * 4 * 3
+    assert len(jobs) == 2 * 3 * (6 * 3 + 4)
     stood = {(job.labels["group"].endswith("at once"), job.call[-1]) for job in jobs}
     assert stood == {(False, STARTS[""]), (True, 0.0)}
     plants = {

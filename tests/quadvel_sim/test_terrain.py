@@ -14,6 +14,10 @@ TERRAINS = {
     "rough": Terrain("rough", size=8.0, seed=3),
     "rough slope": Terrain("rough", slope=0.15, size=8.0, seed=4),
     "hills": Terrain("rough", hills=1.0, size=8.0, seed=5),
+    "slope to the left": Terrain("slope", slope=0.3, direction=0.5 * np.pi),
+    "slope askew": Terrain("slope", slope=-0.3, direction=-2.5),
+    "ramp up": Terrain("slope", slope=0.3, level=1.0, size=8.0),
+    "ramp down, to the right": Terrain("slope", slope=-0.3, direction=-0.5 * np.pi, level=1.0, size=8.0),
 }
 
 
@@ -42,11 +46,16 @@ def test_height_is_where_a_vertical_ray_hits_the_ground(name: str) -> None:
 @pytest.mark.parametrize("name", TERRAINS)
 def test_tilt_is_the_orientation_of_the_ground_at_the_origin(name: str) -> None:
     terrain = TERRAINS[name]
-    forward = np.zeros(3)
-    mujoco.mju_rotVecQuat(forward, [1.0, 0.0, 0.0], terrain.tilt)
-    assert forward[2] / forward[0] == pytest.approx(
-        (terrain.height(0.1, 0.0) - terrain.height(0.0, 0.0)) / 0.1
-    )
+    up = np.zeros(3)
+    mujoco.mju_rotVecQuat(up, [0.0, 0.0, 1.0], terrain.tilt)
+    rise = [terrain.height(0.1, 0.0) / 0.1, terrain.height(0.0, 0.1) / 0.1]
+    assert -up[:2] / up[2] == pytest.approx(rise, abs=1e-9)
+
+
+def test_a_ramp_begins_after_level_ground_and_rises_along_its_direction() -> None:
+    ramp = Terrain("slope", slope=np.radians(20.0), direction=0.5 * np.pi, level=1.0)
+    np.testing.assert_allclose(ramp.height(3.0, [-2.0, 0.0, 1.0]), 0.0, atol=1e-12)
+    assert ramp.height(-1.0, 2.5) == pytest.approx(1.5 * np.tan(np.radians(20.0)))
 
 
 def test_rough_ground_is_bounded_and_fills_its_bound() -> None:

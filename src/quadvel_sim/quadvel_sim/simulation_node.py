@@ -162,7 +162,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         marker.header.frame_id = ODOM
         marker.pose.orientation.w = marker.scale.x = marker.scale.y = marker.scale.z = 1.0
         marker.color.r, marker.color.g, marker.color.b, marker.color.a = GROUND_RGBA
-        step = GROUND_SPACING_M if terrain.kind == "rough" else GROUND_SIZE_M
+        step = GROUND_SPACING_M if terrain.is_grid else GROUND_SIZE_M
         corners = [] if flat else terrain.triangles(GROUND_SIZE_M, step).tolist()
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in corners]
         self._ground.publish(marker)

@@ -62,14 +62,17 @@ DEFAULT_SLOPE_RAD = 0.175
 
 @attrs.frozen
 class Terrain:
-    """Ground z = x tan(slope) + noise(x, y) in the world frame; the noise is zero near the origin.
+    """Ground z = tan(slope) s + noise(x, y) in the world frame; the noise is zero near the origin.
+
+    s is the distance from the origin along `direction`. On a ramp it counts from `level` on, and the
+    ground before it is level.
 
     Raises:
         ValueError: A value is out of its range, or flat ground has a slope.
 
     Attributes:
         kind: `flat`, `slope` or `rough`.
-        slope: Inclination, rad; positive rises along +x. Zero for flat ground.
+        slope: Inclination, rad; positive rises along `direction`. Zero for flat ground.
         roughness: Amplitude of the noise of rough ground, m.
         wavelength: Lattice spacing of the noise, m: about the distance from a hump to the next
             hollow.
@@ -77,8 +80,10 @@ class Terrain:
             valley.
         blend: Distance over which rough ground grows from level to its full roughness, m. A long
             distance gives a field from easy to hard.
-        size: Edge of the square of rough ground, m. Flat ground and slopes are infinite.
+        size: Edge of the square of rough ground or of a ramp, m. Flat ground and slopes are infinite.
         seed: Seed of rough ground.
+        direction: Direction in which a slope rises, rad, from +x to the left.
+        level: Level ground before a ramp begins, m; 0 for a slope that has no beginning.
     """
 
     kind: str = field("flat", one_of=KINDS)
@@ -89,10 +94,24 @@ class Terrain:
     blend: float = field(0.5, at_least=0.1, at_most=100.0)
     size: float = field(40.0, at_least=4.0, at_most=200.0)
     seed: int = field(0, at_least=0, whole=True)
+    direction: float = field(0.0, at_least=-np.pi, at_most=np.pi)
+    level: float = field(0.0, at_least=0.0, at_most=100.0)
 
     def __attrs_post_init__(self) -> None:
         if self.kind == "flat" and self.slope != 0.0:
             raise ValueError(f"Terrain.slope: found {self.slope} rad with kind 'flat', expected 0")
+
+    @property
+    def is_grid(self) -> bool:
+        """Whether the ground is a height field, not a plane."""
+        return self.kind == "rough" or self.level > 0.0
+
+    def _rise(self, x: Array, y: Array) -> Array:
+        """Height of slope or ramp, m."""
+        along = np.cos(self.direction) * x + np.sin(self.direction) * y
+        if self.level > 0.0:
+            along = np.maximum(along - self.level, 0.0)
+        return np.asarray(np.tan(self.slope) * along)
 
     @cached_property
     def _heights(self) -> Array:
@@ -100,16 +119,21 @@ class Terrain:
         points = round(self.size / _GRID_SPACING_M) + 1
         axis = np.linspace(0.0, self.size, points)
         x, y = np.meshgrid(axis, axis)
+        rise = self._rise(x - 0.5 * self.size, y - 0.5 * self.size)
+        if self.kind != "rough":
+            return rise
         bumps = self.roughness * perlin(x, y, self.wavelength, self.seed)
         hills = self.hills * perlin(x, y, _HILL_SPACING_M, self.seed + 1)
-        x, y = x - 0.5 * self.size, y - 0.5 * self.size
-        grown = np.clip((np.hypot(x, y) - _LEVEL_RADIUS_M) / self.blend, 0.0, 1.0)
-        return np.asarray(x * np.tan(self.slope) + grown * (bumps + hills))
+        distance = np.hypot(x - 0.5 * self.size, y - 0.5 * self.size)
+        grown = np.clip((distance - _LEVEL_RADIUS_M) / self.blend, 0.0, 1.0)
+        return np.asarray(rise + grown * (bumps + hills))
 
     @property
     def tilt(self) -> Array:
         """Orientation of the ground at the origin, ground to world, (4,), (w, x, y, z)."""
-        return np.array([np.cos(0.5 * self.slope), 0.0, -np.sin(0.5 * self.slope), 0.0])
+        half = 0.5 * self.slope if self.level == 0.0 else 0.0
+        axis = np.array([np.sin(self.direction), -np.cos(self.direction), 0.0])
+        return np.concatenate([[np.cos(half)], np.sin(half) * axis])
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Interpolate the height of the ground as MuJoCo's height field does.
@@ -119,11 +143,11 @@ class Terrain:
             y: Coordinates, m; shapes of `x` and `y` broadcast.
 
         Returns:
-            Height, m; beyond the edge of rough ground the height of the edge.
+            Height, m; beyond the edge of a height field the height of the edge.
         """
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
-        if self.kind != "rough":
-            return np.asarray(x * np.tan(self.slope))
+        if not self.is_grid:
+            return self._rise(x, y)
         heights, last = self._heights, len(self._heights) - 1
         u, v = (np.clip((c + 0.5 * self.size) / _GRID_SPACING_M, 0.0, last) for c in (x, y))
         column, row = (np.minimum(c.astype(int), last - 1) for c in (u, v))
@@ -158,7 +182,7 @@ class Terrain:
         """
         # The robot's geoms collide with contype 1 only.
         common = {"name": GEOM_NAME, "contype": 1, "conaffinity": 0, "material": GEOM_NAME}
-        if self.kind != "rough":
+        if not self.is_grid:
             spec.worldbody.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 0.1], quat=self.tilt, **common
             )

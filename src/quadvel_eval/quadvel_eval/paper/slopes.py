@@ -29,8 +29,46 @@ from .conditions import (
 )
 from .section import Job, JobResults, Record, Row, Section, Study, by_policy, distinct, select
 
-SLOPES = {-15.0: "15 degrees down", -7.5: "7.5 degrees down", 7.5: "7.5 degrees up", 15.0: "15 degrees up"}
-"""Slopes (degrees, rising ahead of the robot at the start) and their names."""
+LEVEL_M = 1.0  # of level ground before a ramp
+
+
+@attrs.frozen
+class Ground:
+    """A slope, and the commands that are walked on it.
+
+    Attributes:
+        degrees: Inclination, degrees.
+        direction: Direction in which it rises, degrees, from ahead of the robot at the start to the left.
+        level: Level ground before it begins, m; 0: the robot starts on it.
+        commands: vx, vy (m/s), wz (rad/s) of each walk.
+    """
+
+    degrees: float
+    direction: float = 0.0
+    level: float = 0.0
+    commands: tuple[Command, ...] = COMMANDS
+
+    @property
+    def terrain(self) -> Terrain:
+        """The ground of the simulator."""
+        slope, direction = np.radians([self.degrees, self.direction]).tolist()
+        return Terrain(kind="slope", slope=slope, direction=direction, level=self.level)
+
+
+AHEAD, SIDEWAYS = COMMANDS[:1], COMMANDS[1:2]
+GROUNDS = {
+    "15 degrees down": Ground(-15.0),
+    "7.5 degrees down": Ground(-7.5),
+    "7.5 degrees up": Ground(7.5),
+    "15 degrees up": Ground(15.0),
+    "15 degrees up to the left": Ground(15.0, 90.0),
+    "15 degrees up to the right": Ground(15.0, -90.0),
+    "ahead onto 20 degrees down": Ground(-20.0, level=LEVEL_M, commands=AHEAD),
+    "ahead onto 20 degrees up": Ground(20.0, level=LEVEL_M, commands=AHEAD),
+    "sideways onto 20 degrees down": Ground(-20.0, 90.0, LEVEL_M, SIDEWAYS),
+    "sideways onto 20 degrees up": Ground(20.0, 90.0, LEVEL_M, SIDEWAYS),
+}
+"""Names of the slopes; the last four are walked onto from level ground."""
 STANDING_TIME_S = 2.0  # on the slope before the command to walk
 STARTS = {"": STANDING_TIME_S, "started at once": 0.0}
 """Names of the starts, and standing time before the walk, s."""
@@ -71,7 +109,7 @@ TITLES = {
 
 
 def conditions(plant: str, start: str) -> list[Condition]:
-    """List all slopes on a plant with a start.
+    """List the slopes of GROUNDS on a plant with a start.
 
     Args:
         plant: Key of HARD_PLANTS.
@@ -83,11 +121,11 @@ def conditions(plant: str, start: str) -> list[Condition]:
     return [
         Condition(
             group_name(plant, start),
-            f"{degrees:g}",
-            {**HARD_PLANTS[plant], "terrain": Terrain(kind="slope", slope=float(np.radians(degrees)))},
+            name,
+            {**HARD_PLANTS[plant], "terrain": ground.terrain},
             standing_time=STARTS[start],
         )
-        for degrees in SLOPES
+        for name, ground in GROUNDS.items()
     ]
 
 
@@ -98,21 +136,19 @@ class Slopes(Section):
     Attributes:
         plants: Keys of HARD_PLANTS.
         starts: Keys of STARTS.
-        commands: vx, vy (m/s), wz (rad/s) of each walk.
     """
 
     name: ClassVar[str] = "slopes"
     title: ClassVar[str] = "Robustness: slopes"
     method: ClassVar[str] = (
-        "Slopes that rise (up) or fall (down) ahead of the robot at the start. It stands there for 2 s, or starts at once, 0.5 s "
-        "after it was put there, and walks for 6 s ahead (1 m/s), sideways (0.5 m/s) or along an arc (0.6 m/s, 0.6 rad/s), which "
-        "turns it across the slope. Survival: share of the robots that did not fall. A robot that does not fall, but is off its "
+        "Slopes that rise (up) or fall (down) ahead of the robot at the start, or to its side. It stands there for 2 s, or starts "
+        "at once, 0.5 s after it was put there, and walks for 6 s ahead (1 m/s), sideways (0.5 m/s) or along an arc (0.6 m/s, "
+        "0.6 rad/s), which turns it on the slope. Slopes of 20 degrees begin after 1 m of level ground. Survival: share of the robots that did not fall. A robot that does not fall, but is off its "
         "command by more than 0.15 m/s on the mean of the last 4 s, is stuck: it does not follow. The second plant is that of "
         "Figure 10; its loose joints have neither friction nor damping. The paper gives no figures."
     )
     plants: tuple[str, ...] = tuple(HARD_PLANTS)
     starts: tuple[str, ...] = tuple(STARTS)
-    commands: tuple[Command, ...] = COMMANDS
 
     @override
     def jobs(self, study: Study) -> list[Job]:
@@ -121,7 +157,7 @@ class Slopes(Section):
             for policy, plant, start in itertools.product(study.policies, self.plants, self.starts)
             for seed in range(study.seeds)
             for one in conditions(plant, start)
-            for command in self.commands
+            for command in GROUNDS[one.level].commands
         ]
 
     @override
@@ -131,12 +167,13 @@ class Slopes(Section):
     @override
     def figure(self, records: Sequence[Record]) -> Figure:
         groups = distinct(records, "group")
-        figure = Figure(figsize=(3.2 * len(groups), 4.6), layout="constrained")
+        figure = Figure(figsize=(3.2 * len(groups), 6.0), layout="constrained")
         panels = figure.subplots(2, len(groups), sharey="row", squeeze=False)
         for (error, stood), name in zip(panels.T, groups, strict=True):
             draw_error_and_survival(error, stood, select(records, group=name))
             error.set_title(name)
-            stood.set_xlabel("slope, degrees")
+            error.tick_params(axis="x", labelbottom=False)
+            stood.tick_params(axis="x", rotation=90)
         panels[0, 0].set_ylabel("mean error, m/s")
         panels[1, 0].set_ylabel("survival, %")
         panels[0, 0].legend()
@@ -145,9 +182,9 @@ class Slopes(Section):
     @override
     def rows(self, records: Sequence[Record]) -> list[Row]:
         rows = []
-        for name, degrees in itertools.product(distinct(records, "group"), SLOPES):
-            mine = [r for r in select(records, group=name) if float(r["level"]) == degrees]
-            what = TITLES[name] + SLOPES[degrees]
+        for name, ground in itertools.product(distinct(records, "group"), GROUNDS):
+            mine = select(records, group=name, level=ground)
+            what = TITLES[name] + ground
             following = by_policy(mine, survival_and_following)
             rows += [
                 Row(f"{what}: survive and follow", "%", None, following, 1, key=True),
