@@ -120,20 +120,21 @@ def test_limits_of_commands_are_narrowed_in_the_file_and_the_network_stays(tmp_p
     path = tmp_path / "policy.onnx"
     path.write_bytes(SHIPPED_POLICY.read_bytes())
     before = PolicyFile(ALIENGO, path)
-    main.limit(path, forward=1.5, turn=0.7)
+    main.limit(path, forward=1.5, turn=0.7, curve=1.2)
     after = PolicyFile(ALIENGO, path)
     vx, vy = (before.metadata.command_limits[axis] for axis in ("vx", "vy"))
     assert after.metadata.command_limits == {"vx": (vx[0], 1.5), "vy": vy, "wz": (-0.7, 0.7)}
     kept, now = (json.loads(one.metadata.to_json()) for one in (before, after))
-    assert {name for name in kept if kept[name] != now[name]} == {"command_limits"}
+    assert {name for name in kept if kept[name] != now[name]} == {"command_limits", "curve_limit"}
+    assert after.metadata.curve_limit == 1.2
     seen = np.linspace(-1.0, 1.0, before.metadata.observation.size, dtype=np.float32)
     assert np.array_equal(before.step(seen), after.step(seen))
 
 
-@pytest.mark.parametrize("wider", [{"forward": 9.0}, {"backward": 9.0}, {"sideways": 9.0}, {"turn": 9.0}])
+@pytest.mark.parametrize("wider", [{axis: 9.0} for axis in ("forward", "backward", "sideways", "turn", "curve")])
 def test_limits_are_never_widened_beyond_what_was_trained(tmp_path, wider):
     path = tmp_path / "policy.onnx"
     path.write_bytes(SHIPPED_POLICY.read_bytes())
-    with pytest.raises(ValueError, match=r"policy.onnx: command_limits[.]"):
+    with pytest.raises(ValueError, match=r"policy.onnx: (command_limits[.]|curve_limit)"):
         main.limit(path, **wider)
     assert path.read_bytes() == SHIPPED_POLICY.read_bytes()

@@ -353,6 +353,9 @@ def limit(
     backward: Annotated[float | None, typer.Option(help="Fastest backward, m/s.", min=0.0)] = None,
     sideways: Annotated[float | None, typer.Option(help="Fastest to either side, m/s.", min=0.0)] = None,
     turn: Annotated[float | None, typer.Option(help="Fastest turn either way, rad/s.", min=0.0)] = None,
+    curve: Annotated[
+        float | None, typer.Option(help="Largest lateral acceleration in curves, m/s^2.", min=0.1)
+    ] = None,
     robot: Annotated[str, typer.Option(help="Robot of the policy: a name, or its folder.")] = DEFAULT_ROBOT,
 ) -> None:
     """Narrow the commands that a policy file accepts; limits that are not given stay. Write its card again afterwards.
@@ -368,7 +371,7 @@ def limit(
     limiting.limit_commands(
         chosen,
         policy,
-        VelocityCommandLimits((low[0], low[1], low[2]), (high[0], high[1], high[2]), known.curve),
+        VelocityCommandLimits((low[0], low[1], low[2]), (high[0], high[1], high[2]), curve or known.curve),
     )
     _written(policy)
 

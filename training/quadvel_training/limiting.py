@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import attrs
+import numpy as np
 
 from quadvel_description.network_file import read_network
 from quadvel_description.onnx_format import message, serialise
@@ -41,6 +42,10 @@ def limit_commands(robot: Robot, policy: Path, limits: VelocityCommandLimits) ->
                 f"{policy}: command_limits.{axis}: found {low:g} to {high:g}, expected a range within "
                 f"{least:g} to {most:g} that contains 0"
             )
+    if metadata.curve_limit is not None and (limits.curve or np.inf) > metadata.curve_limit:
+        raise ValueError(
+            f"{policy}: curve_limit: found {limits.curve} m/s^2, expected {metadata.curve_limit:g} or less"
+        )
     narrowed = attrs.evolve(metadata, command_limits=bounds, curve_limit=limits.curve)
     model = read_network(policy)
     text = message("StringStringEntryProto", key=METADATA_KEY, value=narrowed.to_json())
