@@ -131,7 +131,9 @@ def test_limits_of_commands_are_narrowed_in_the_file_and_the_network_stays(tmp_p
     assert np.array_equal(before.step(seen), after.step(seen))
 
 
-@pytest.mark.parametrize("wider", [{axis: 9.0} for axis in ("forward", "backward", "sideways", "turn", "curve")])
+@pytest.mark.parametrize(
+    "wider", [{axis: 9.0} for axis in ("forward", "backward", "sideways", "turn", "curve")]
+)
 def test_limits_are_never_widened_beyond_what_was_trained(tmp_path, wider):
     path = tmp_path / "policy.onnx"
     path.write_bytes(SHIPPED_POLICY.read_bytes())

@@ -197,9 +197,7 @@ def test_the_targets_of_the_script_do_not_jump_over_a_cycle(vx):
     clock = GaitClock(n)
     clock.velocity[:], clock.walking[:] = [vx, 0.1, 0.3], True
     clock.phase = np.linspace(0.0, 1.0, n, endpoint=False)
-    past = SimpleNamespace(
-        clock=clock, cruise=clock.velocity, lag=np.zeros((n, 3)), turn_correction=np.zeros(n)
-    )
+    past = SimpleNamespace(clock=clock, steady=np.ones(n), lag=np.zeros((n, 3)), turn_correction=np.zeros(n))
     targets = joint_offsets(env, past)
     steps = np.abs(np.diff(targets, axis=0, append=targets[:1]))  # rad in 1/2000 of a cycle
     assert steps.max() < 0.02

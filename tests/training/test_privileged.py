@@ -19,11 +19,11 @@ from quadvel_training.command_grid import CELL_WIDTH, INITIAL_REACH, CommandGrid
 from quadvel_training.env import EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.past import (  # noqa: E402
     CATCH_UP_TURN,
-    CRUISE_END_S,
-    CRUISE_S,
     LASTING_S,
     MAX_LAG,
     STANDING_S,
+    STEADY_END_S,
+    STEADY_S,
     TRANSIENT_S,
     Past,
 )
@@ -174,7 +174,7 @@ def walking_feet(env: VelocityEnv, planned: list[float], lag: list[float]) -> np
     """Feet (4, 3) of the scripted trot of a robot that moves as planned."""
     past = Past(env)
     past.clock.walking[:], past.lag[:, : len(lag)] = True, lag
-    past.clock.velocity[:] = past.cruise[:] = planned
+    past.clock.velocity[:], past.steady[:] = planned, 1.0
     env.velocity[:, :2], env.angular_velocity[:] = planned[:2], [0.0, 0.0, planned[2]]
     offsets = joint_offsets(env, past)
     return foot_positions(ALIENGO, ALIENGO.nominal_q + offsets[0])
@@ -189,7 +189,7 @@ def test_a_robot_that_lags_behind_places_its_feet_behind_and_one_that_drifts_asi
     env = VelocityEnv(CALM)
     usual = walking_feet(env, [1.0, 0.0, 0.0], [0.0, 0.0])
     moved = walking_feet(env, [1.0, 0.0, 0.0], [0.2, -0.2]) - usual
-    assert moved[:, :2] == pytest.approx(np.tile([-0.026, 0.026], (4, 1)), abs=2e-3)
+    assert moved[:, :2] == pytest.approx(np.tile([-0.06, 0.06], (4, 1)), abs=2e-3)
 
 
 def feet_on_slope(rise: float) -> np.ndarray:
@@ -215,7 +215,7 @@ def test_on_a_slope_the_trunk_stays_parallel_to_the_ground_and_the_feet_are_plac
 def test_the_teacher_of_a_robot_that_turned_too_little_gets_a_faster_yaw_rate():
     env = VelocityEnv(CALM)
     env.command[:], past, previous = [0.5, 0.0, 1.0, 0.0], Past(env), np.zeros((4, 12))
-    past.clock.walking[:], past.clock.velocity[:] = True, [0.5, 0.0, 1.0]
+    past.clock.walking[:], past.clock.velocity[:], past.steady[:] = True, [0.5, 0.0, 1.0], 1.0
     usual = privileged.observe(env, past, previous)
     past.lag[1:, 2] = 0.1  # rad
     added = privileged.observe(env, past, previous) - usual
@@ -300,20 +300,35 @@ def test_an_error_that_lasts_is_that_of_this_command_alone_and_without_its_begin
     assert (past.lasting[:, 0] == 0.0).tolist() == [False, True, False, False]
 
 
-def test_a_velocity_counts_as_lasting_once_the_plan_has_reached_it_and_ends_with_a_new_command():
+def test_a_robot_is_behind_by_what_its_plan_moved_farther_until_it_stands():
+    env = VelocityEnv(CALM)
+    past, command = Past(env), np.tile([0.3, 0.0, 0.0, 0.0], (4, 1))
+    past.clock.velocity[:], env.velocity[:], env.angular_velocity[:] = command[:, :3], 0.0, 0.0
+    seconds = 0.4
+    for k in range(round(seconds / env.config.period)):
+        env.changed[:] = k == 10  # a new command ends nothing
+        past.advance(command)
+    assert past.lag == pytest.approx(np.tile([0.3 * seconds, 0.0, 0.0], (4, 1)), abs=1e-9)
+    past.down[:] = 1.0
+    command[:] = [0.0, 0.0, 0.0, 1.0]
+    past.advance(command)
+    assert not past.lag.any()
+
+
+def test_a_velocity_counts_as_steady_once_the_plan_has_reached_it_and_ends_with_a_new_command():
     env = VelocityEnv(CALM)
     past, command = Past(env), np.tile([1.0, 0.2, 0.5, 0.0], (4, 1))
     while (past.clock.velocity != command[:, :3]).any():
-        assert not past.cruise.any()
+        assert not past.steady.any()
         past.advance(command)
-    for _ in range(round(10 * CRUISE_S / env.config.period)):
+    for _ in range(round(10 * STEADY_S / env.config.period)):
         past.advance(command)
-    assert past.cruise == pytest.approx(command[:, :3], rel=1e-3)
+    assert past.steady == pytest.approx(np.ones(4), rel=1e-3)
     command[1, 1] = -1.5
-    for _ in range(round(3 * CRUISE_END_S / env.config.period)):
+    for _ in range(round(3 * STEADY_END_S / env.config.period)):
         past.advance(command)
-    assert (np.abs(past.cruise[1]) < 0.06).all()
-    assert past.cruise[0] == pytest.approx(command[0, :3], rel=1e-3)
+    assert past.steady[1] < 0.06
+    assert past.steady[0] == pytest.approx(1.0, rel=1e-3)
 
 
 def test_who_runs_off_rough_ground_has_no_time_left_but_has_not_fallen():

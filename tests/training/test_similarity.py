@@ -69,8 +69,8 @@ def test_the_script_moves_robots_of_all_sizes_alike(monkeypatch):
     lag, turn, clock = rng.normal(0.0, 0.1, (n, 2)), rng.normal(0.0, 0.2, n), GaitClock(n)
     clock.velocity, clock.phase = rng.normal(0.0, 1.0, (n, 3)), rng.uniform(0.0, 1.0, n)
     clock.walking[:] = True
-    cruise = 0.5 * clock.velocity
-    past = SimpleNamespace(clock=clock, cruise=cruise, lag=lag, turn_correction=turn)
+    steady = np.full(n, 0.5)
+    past = SimpleNamespace(clock=clock, steady=steady, lag=lag, turn_correction=turn)
     expected = scripted_trot.joint_offsets(large, past)
 
     speeds, rates = np.array([size.time, size.time, 1 / size.time]), 1 / size.time
@@ -85,7 +85,7 @@ def test_the_script_moves_robots_of_all_sizes_alike(monkeypatch):
     # the lead is that of the drives, which does not scale
     monkeypatch.setattr(scripted_trot, "LEAD_S", lead * size.time)
     its_past = SimpleNamespace(
-        clock=its_clock, cruise=cruise * speeds, lag=lag * size.length, turn_correction=turn / size.time
+        clock=its_clock, steady=steady, lag=lag * size.length, turn_correction=turn / size.time
     )
     found = scripted_trot.joint_offsets(SimpleNamespace(robot=small, size=size, **alike), its_past)
     np.testing.assert_allclose(found, expected, atol=1e-12)

@@ -20,7 +20,7 @@ import torch
 from quadvel_description import symmetry
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
-from quadvel_policy.observation import OBSERVATION_SIZE, VelocityCommandLimits
+from quadvel_policy.observation import OBSERVATION_SIZE
 from quadvel_sim.terrain import Terrain
 
 from . import dagger, privileged, process_group

@@ -12,11 +12,11 @@ from .gait_clock import GaitClock
 
 STRIDE_S = 0.35  # time constant of stride errors: about a stride
 LASTING_S = 1.5  # time constant of lasting errors
-MAX_LAG = 0.4  # m, m, rad: a robot that does not follow is not to make up for more later
+MAX_LAG = 0.2  # m, m, rad: a robot that does not follow is not to make up for more later
 CATCH_UP_TURN = 2.0  # 1/s: this times the angle that a robot lags behind is added to its teacher's yaw rate
 TRANSIENT_S = 1.0  # after the plan has reached a command, not part of lasting errors and scores
-CRUISE_S = 0.5  # time constant with which a velocity that the plan has reached counts as lasting,
-CRUISE_END_S = 0.1  # and with which it ceases to under a new command
+STEADY_S = 0.5  # time constant with which a velocity that the plan has reached counts as steady,
+STEADY_END_S = 0.1  # and with which it ceases to under a new command
 STANDING_S = 0.2  # on four feet; after that, setting off means choosing a side
 
 
@@ -29,12 +29,12 @@ class Past:
             `STRIDE_S`.
         lasting: (n, 3), the same over `LASTING_S`; set to zero by a new command, it changes while
             the robot is `settled`.
-        lag: (n, 3), m, m, rad, the integral of the error, over the same time as `lasting`.
+        lag: (n, 3), m, m, rad, how far the robot is behind its plan: the integral of planned velocity
+            minus velocity in the body frame, over all commands; 0 while it stands.
         air: (n, 4), s since the foot left the ground; 0 on the ground.
         down: (n, 4), s since the foot touched the ground; 0 in the air.
         clock: plan of the steps.
-        cruise: (n, 3), planned velocity that lasts: 0 after a new command, it grows over `CRUISE_S`
-            to the command once the plan has reached it.
+        steady: (n,), 0 under a new command, grows over `STEADY_S` to 1 once the plan has reached it.
         off_hip: (n, 4), m, body frame: of a foot that has just left the ground, how far ahead of
             its hip the middle of its stance was; else 0.
     """
@@ -50,7 +50,7 @@ class Past:
         self.stride, self.lasting, self.lag = (np.zeros((n, 3)) for _ in range(3))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
         self.off_hip, self.clock = np.zeros((n, 4)), GaitClock(n, env.size)
-        self.cruise = np.zeros((n, 3))
+        self.steady = np.zeros(n)
         self._age = np.zeros(n)  # s, since the plan has the commanded velocity
         self._landed, self._last = np.zeros((n, 4)), np.zeros((n, 4))  # m ahead of the hip: at touchdown, now
 
@@ -68,7 +68,7 @@ class Past:
             self.down,
             self.off_hip,
             self._age,
-            self.cruise,
+            self.steady,
         ):
             array[ids] = 0.0
         self.clock.reset(ids)
@@ -85,13 +85,16 @@ class Past:
         self.stride += (error - self.stride) * period / STRIDE_S
         reached = (self.clock.velocity == command[:, :3]).all(axis=1)[:, None]
         self._age += period * reached[:, 0]
-        taking = np.where(reached, CRUISE_S, CRUISE_END_S) * env.size.time
-        self.cruise += (self.clock.velocity * reached - self.cruise) * period / taking
+        taking = np.where(reached[:, 0], STEADY_S, STEADY_END_S) * env.size.time
+        self.steady += (reached[:, 0] - self.steady) * period / taking
         settled = self.settled[:, None]
         self.lasting += (error - self.lasting) * settled * period / LASTING_S
-        self.lag = np.clip(self.lag + error * settled * period, -MAX_LAG, MAX_LAG)
-        for array in (self.lasting, self.lag, self._age):
-            array[env.changed] = 0.0
+        # l <- l + (v_planned - v) dt, within MAX_LAG; 0 for a robot that stands
+        behind = (self.clock.velocity - env.planar_velocity) * period
+        self.lag = np.clip(self.lag + behind, -MAX_LAG, MAX_LAG)
+        self.lag[self.standing & (command[:, 3] > 0.5)] = 0.0
+        self.lasting[env.changed] = 0.0
+        self._age[env.changed] = 0.0
         self._advance_stances()
         speed = np.hypot(env.velocity[:, 0], env.velocity[:, 1])
         self.clock.advance(command, speed, env.contact & (self.air >= self.clock.shortest_swing), period)
@@ -113,7 +116,8 @@ class Past:
         Returns:
             (n,), rad/s.
         """
-        return np.asarray(CATCH_UP_TURN / self.env.size.time * self.lag[:, 2] * self.clock.walking)
+        lag = self.lag[:, 2] * self.steady * self.clock.walking
+        return np.asarray(CATCH_UP_TURN / self.env.size.time * lag)
 
     @property
     def settled(self) -> np.ndarray:

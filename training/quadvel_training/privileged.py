@@ -21,7 +21,6 @@ from quadvel_description import symmetry
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.symmetry import sign_mirror
-from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_sim.terrain import Terrain
 
 from . import loop, process_group

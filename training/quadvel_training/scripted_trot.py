@@ -24,7 +24,7 @@ LIFT_M = 0.09  # height of a swing
 LONGEST_STEP_M = 0.108  # way of a foot under the trunk in one stance
 LEAD_S = 0.05  # joints follow their targets so late, whatever the size
 PLACEMENT_S = np.array([0.103, 0.073])  # x, y: feet are placed this time times the excess velocity out,
-CATCH_UP = 0.13  # and this share of the way that the robot lags behind its command behind
+CATCH_UP = 0.3  # and this share of the way that the robot lags behind its plan behind
 BEHIND_S = np.array([0.092, 0.037])  # targets of stance feet are this time times the planned velocity behind,
 DRAG = np.array([0.0105, 0.0])  # s^2/m, and this times its square: joints push the trunk forward
 MAX_BEHIND = np.array([0.46, 2.0])  # m/s, planned velocity that counts
@@ -56,7 +56,8 @@ def joint_offsets(env: VelocityEnv, past: Past) -> np.ndarray:
     # All velocities and lengths here are those of a reference robot that moves alike.
     robot, size, clock = env.robot, env.size, past.clock
     planned, velocity = size.as_reference(clock.velocity), size.as_reference(env.planar_velocity)
-    cruise = size.as_reference(past.cruise)
+    steady = past.steady[:, None]
+    cruise = planned * steady
     planned[:, 2] += past.turn_correction * size.time
     below = foot_positions(robot, robot.nominal_q) / size.length + [0.0, 0.0, CROUCH_M]  # (4, 3), trunk frame
     duty, frequency = clock.duty, clock.frequency * size.time
@@ -79,7 +80,7 @@ def joint_offsets(env: VelocityEnv, past: Past) -> np.ndarray:
     #     - loaded (BEHIND_S clip(v_planned) + DRAG |v_planned| v_planned)
     # A trunk at height h above feet that are a distance d aside accelerates by g d / h. The last
     # term acts in stance alone: joints push the trunk forward, and swings end further ahead.
-    placed = PLACEMENT_S * excess - CATCH_UP * past.lag[:, :2] / size.length * clock.walking[:, None]
+    placed = PLACEMENT_S * excess - CATCH_UP * past.lag[:, :2] / size.length * steady * clock.walking[:, None]
     aside = CURVE * HEIGHT_M / GRAVITY * _turned(cruise[:, None, :2], cruise[:, 2])[:, 0]
     aside[:, 1] += SIDEWAYS_S * cruise[:, 1]
     placed -= _bounded(aside, MAX_ASIDE_M)
