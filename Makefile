@@ -21,6 +21,9 @@ BUILD_INTERFACES := ros_ws/wheels/build_interfaces.py
 INTERFACES := $(BUILD_INTERFACES) $(wildcard src/quadvel_msgs/*/* ros_ws/wheels/*/*/*)
 INSTALL = -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable
 
+# Sections of `make paper` that do not ask for the AlienGo's own actuator model or the paper's curves.
+GO2_SECTIONS := gait tracking sustained steps energy robustness slopes stance
+
 .PHONY: help setup ros demo close-the-loop paper faults test tutorials ros-tests test-ros lint format docs pictures bench lock clean
 
 help:  ## list the targets
@@ -34,8 +37,9 @@ demo: setup  ## run the demo walk of a simulated robot; results in out/demo
 close-the-loop: setup  ## test the identification on three plants with unknown effects; results in out/twin
 	$(VENV)/bin/quadvel twin --out out/twin
 
-paper: setup  ## measure the paper's figures; resumes after a stop; results in docs/results/paper
+paper: setup  ## measure the paper's figures with both robots; resumes after a stop; results in docs/results
 	$(VENV)/bin/quadvel paper --out docs/results/paper
+	$(VENV)/bin/quadvel paper --robot go2 --out docs/results/paper_go2 $(GO2_SECTIONS:%=--only %)
 
 ros: $(ROS_VENV)/.run  ## create .venv-ros with ROS 2's own rclpy; needs no ROS 2 installation
 

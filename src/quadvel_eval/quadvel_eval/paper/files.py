@@ -143,20 +143,22 @@ def _value(text: str) -> Any:
     return text or None
 
 
-def write_page(folder: Path, sections: Sequence[Section]) -> None:
+def write_page(folder: Path, sections: Sequence[Section], robot: str) -> None:
     """Write the page with all sections whose files are in the folder.
 
     Args:
         folder: Folder of the files.
         sections: Sections in the order of the page.
+        robot: Name of the robot, or its folder; the paper's is the AlienGo.
     """
+    title = load_robot(robot).title
     there = [section for section in sections if (folder / f"{section.name}.json").exists()]
     rows = {section: section.rows(read_records(folder / f"{section.name}.csv")) for section in there}
     lines = [
-        "# Section 4 of the paper, in simulation",
+        f"# Section 4 of the paper, in simulation: {title}",
         "",
-        "Written by `quadvel paper` (`make paper`); do not edit. The paper's values are those of its CRL-EAM, on the robot; ours",
-        "those of simulated robots with actuator model, sensor noise, delays and the estimator in the loop. In brackets: ours",
+        "Written by `quadvel paper` (`make paper`); do not edit. The paper's values are those of its CRL-EAM, on an AlienGo; ours",
+        f"those of a simulated {title} with actuator model, sensor noise, delays and the estimator in the loop. In brackets: ours",
         "minus the paper's. Figures that fall short stand here as they are.",
         "",
         *markdown_table(

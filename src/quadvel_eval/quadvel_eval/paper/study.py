@@ -104,9 +104,9 @@ def run_sections(
         if completed:
             own = [(job.labels, answers[k]) for k, (s, job) in enumerate(jobs) if s is section]
             write_section(folder, section, study, section.to_records(own))
-            write_page(folder, SECTIONS)
+            write_page(folder, SECTIONS, study.robot)
         report_progress(Progress(done, len(jobs), completed, seconds[section.name]))
-    write_page(folder, SECTIONS)
+    write_page(folder, SECTIONS, study.robot)
     return [section.name for section in todo]
 
 
