@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from quadvel_description.robot import Robot
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver import wire
 from quadvel_driver.board_state import BoardState
@@ -22,7 +23,7 @@ from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.bad_network import BadNetwork, NetworkConfig
 from quadvel_sim.simulator import Simulator, SimulatorConfig
-from tests.helpers.robots import ALIENGO
+from tests.helpers.robots import ALIENGO, GO2
 
 BAD = NetworkConfig(network_loss=0.02, network_jitter=0.002)
 TURNS = 4  # of the link, a millisecond
@@ -53,16 +54,16 @@ class Wire(Transport):
 class BehindNetwork:
     """A simulator as its driver shows it: what it reports and is told goes through packets and a bad network."""
 
-    def __init__(self, network: NetworkConfig, packets: Any) -> None:
-        self._packets = packets
-        self._simulator = Simulator(SimulatorConfig(robot=ALIENGO))
+    def __init__(self, network: NetworkConfig, robot: Robot, packets: Any) -> None:
+        self._packets, self._robot = packets, robot
+        self._simulator = Simulator(SimulatorConfig(robot=robot))
         self.config = self._simulator.config
         self._simulator.reset("stand")
         self._there, self._back = BadNetwork(network, 0), BadNetwork(network, 1)
         self._wire = Wire()
         self._newest: RobotState | None = None
         self.time = 50.0
-        self.link = Link(ALIENGO, packets, self._wire, LinkConfig(), self._on_state, clock=lambda: self.time)
+        self.link = Link(robot, packets, self._wire, LinkConfig(), self._on_state, clock=lambda: self.time)
         self._warming_up = True
         self.step(300)  # the link finds out in what unit the board counts
         self._warming_up = False
@@ -88,7 +89,7 @@ class BehindNetwork:
         for _ in range(n):
             if self._warming_up:
                 self._simulator.command(
-                    JointCommand(q=np.array(ALIENGO.nominal_q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+                    JointCommand(q=np.array(self._robot.nominal_q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
                 )
             self._simulator.step(1)
             self._report()
@@ -112,9 +113,9 @@ class BehindNetwork:
                 self._simulator.command(self._packets.decode_command(packet))
 
 
-def walked(simulator: Any, velocity: tuple[float, float, float]) -> np.ndarray:
+def walked(robot: Robot, simulator: Any, velocity: tuple[float, float, float]) -> np.ndarray:
     """Mean vx, vy (m/s), wz (rad/s) of a walk under a command."""
-    loop = RobotLoop(simulator, Supervisor(ALIENGO, PolicyFile(ALIENGO)), LearnedEstimator(ALIENGO))
+    loop = RobotLoop(simulator, Supervisor(robot, PolicyFile(robot)), LearnedEstimator(robot))
     loop.start_walking()
     truths = []
     for tick in range(SETTLE + MEASURE):
@@ -127,21 +128,23 @@ def walked(simulator: Any, velocity: tuple[float, float, float]) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("packets", "velocity"),
+    ("robot", "packets", "velocity"),
     [
-        (wire, (0.5, 0.0, 0.0)),
-        pytest.param(wire, (1.0, 0.0, 0.5), marks=pytest.mark.long),
-        pytest.param(wire, (0.0, 0.4, 0.0), marks=pytest.mark.long),
-        pytest.param(dds_wire, (0.5, 0.0, 0.0), marks=pytest.mark.long),
+        (ALIENGO, wire, (0.5, 0.0, 0.0)),
+        pytest.param(ALIENGO, wire, (1.0, 0.0, 0.5), marks=pytest.mark.long),
+        pytest.param(ALIENGO, wire, (0.0, 0.4, 0.0), marks=pytest.mark.long),
+        (GO2, dds_wire, (0.5, 0.0, 0.0)),
+        pytest.param(GO2, dds_wire, (1.0, 0.0, 0.5), marks=pytest.mark.long),
+        pytest.param(GO2, dds_wire, (0.0, 0.4, 0.0), marks=pytest.mark.long),
     ],
 )
 def test_with_2_percent_loss_and_2_ms_jitter_tracking_is_within_2_cm_per_s(
-    packets: Any, velocity: tuple[float, float, float]
+    robot: Robot, packets: Any, velocity: tuple[float, float, float]
 ) -> None:
-    plain = Simulator(SimulatorConfig(robot=ALIENGO))
+    plain = Simulator(SimulatorConfig(robot=robot))
     plain.reset("stand")
-    behind = BehindNetwork(BAD, packets)
-    without, through = walked(plain, velocity), walked(behind, velocity)
+    behind = BehindNetwork(BAD, robot, packets)
+    without, through = walked(robot, plain, velocity), walked(robot, behind, velocity)
     counts = behind.link.report().counts
     assert counts["late"] > 100
     assert counts["command_timeouts"] == 0
