@@ -89,7 +89,9 @@ class BehindNetwork:
         for _ in range(n):
             if self._warming_up:
                 self._simulator.command(
-                    JointCommand(q=np.array(self._robot.nominal_q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+                    JointCommand(
+                        q=np.array(self._robot.nominal_q), kp=np.full(12, 100.0), kd=np.full(12, 3.0)
+                    )
                 )
             self._simulator.step(1)
             self._report()

@@ -16,7 +16,7 @@ from quadvel_eval.segments import Segment  # noqa: E402
 from quadvel_eval.walk import Setup  # noqa: E402
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile  # noqa: E402
 from quadvel_training import __main__ as main  # noqa: E402
-from quadvel_training.card import SECTIONS, card  # noqa: E402
+from quadvel_training.card import SECTIONS, TABLES, card  # noqa: E402
 from tests.helpers.robots import ALIENGO  # noqa: E402
 
 
@@ -75,7 +75,7 @@ def test_a_policys_card_has_what_the_papers_sections_measured_of_it(evaluation, 
         made = {"made_with": {"policies": {"other": "0" * 12, "mine": digest}}, "rows": [row]}
         (tmp_path / name).write_text(json.dumps(made))
     assert card(SHIPPED_POLICY, [evaluation], tmp_path).count("| 1 m/s: diagonal feet alike, % | 5 |") == len(
-        SECTIONS
+        TABLES
     )
     made["made_with"]["policies"].pop("mine")
     (tmp_path / SECTIONS[0]).write_text(json.dumps(made))

@@ -55,7 +55,7 @@ def card(network: Path, evaluations: Sequence[Path], paper: Path | None = None) 
             *_table("how it was made", "", _origin(metadata)),
             "",
             *(line for one in found for line in (*_measured(one, estimator), "")),
-            *(line for name in SECTIONS if paper for line in (*_section(network, paper / name), "")),
+            *(line for name in TABLES if paper for line in (*_section(network, paper / name), "")),
             "Known limits:",
             "",
             *(f"- {limit}" for limit in (_paper_limits(network, paper) if paper else ())),
@@ -136,7 +136,8 @@ def _measured(found: Json, estimator: bool) -> list[str]:
     return _table(f"evaluation: {_conditions(found['setup'])}", "measured", rows)
 
 
-SECTIONS = ("gait.json", "sustained.json", "slopes.json")
+TABLES = ("gait.json", "sustained.json")
+SECTIONS = (*TABLES, "slopes.json")
 Rows = Sequence[tuple[str, str, float | None]]
 """Name, unit and value of a figure"""
 
@@ -195,10 +196,13 @@ def _drive_limits(rows: Rows) -> Iterable[str]:
 
 
 def _slope_limits(rows: Rows) -> Iterable[str]:
-    """Yield the slopes on which robots fell or were stuck."""
-    for what, _, value in rows:
-        where, _, measured = what.rpartition(": ")
-        if measured == "survive and follow" and value is not None and value < 100.0:
+    """Yield how many slopes all robots walk, and those on which robots fell or were stuck."""
+    measured = {what.rpartition(": ")[0]: value for what, _, value in rows if "survive and follow" in what}
+    shares = {where: value for where, value in measured.items() if value is not None}
+    walked = sum(value == 100.0 for value in shares.values())
+    yield f"All robots walk and follow on {walked} of {len(shares)} combinations of slope, plant and start."
+    for where, value in shares.items():
+        if value < 100.0:
             yield f"Slopes, {where}: {100.0 - value:.0f} % of the robots fall or are stuck."
 
 

@@ -17,7 +17,8 @@ from typing_extensions import override
 
 from quadvel_sim.terrain import Terrain
 
-from .cells import Command, cell_record, largest_error, mean_error
+from ..grid import PLANTS
+from .cells import Command, cell_record, largest_error
 from .conditions import (
     COMMANDS,
     HARD_PLANTS,
@@ -25,7 +26,6 @@ from .conditions import (
     Condition,
     condition_job,
     draw_error_and_survival,
-    survival_rate,
 )
 from .section import Job, JobResults, Record, Row, Section, Study, by_policy, distinct, select
 
@@ -187,9 +187,7 @@ class Slopes(Section):
             what = TITLES[name] + ground
             following = by_policy(mine, survival_and_following)
             rows += [
-                Row(f"{what}: survive and follow", "%", None, following, 1, key=True),
-                Row(f"{what}: survival", "%", None, by_policy(mine, survival_rate), 1),
-                Row(f"{what}: mean error", "m/s", None, by_policy(mine, mean_error)),
+                Row(f"{what}: survive and follow", "%", None, following, 1, key=name in PLANTS),
                 Row(f"{what}: largest error", "m/s", None, by_policy(mine, largest_error)),
             ]
         return rows
