@@ -143,9 +143,9 @@ class Slopes(Section):
     method: ClassVar[str] = (
         "Slopes that rise (up) or fall (down) ahead of the robot at the start, or to its side. It stands there for 2 s, or starts "
         "at once, 0.5 s after it was put there, and walks for 6 s ahead (1 m/s), sideways (0.5 m/s) or along an arc (0.6 m/s, "
-        "0.6 rad/s), which turns it on the slope. Slopes of 20 degrees begin after 1 m of level ground. Survival: share of the robots that did not fall. A robot that does not fall, but is off its "
-        "command by more than 0.15 m/s on the mean of the last 4 s, is stuck: it does not follow. The second plant is that of "
-        "Figure 10; its loose joints have neither friction nor damping. The paper gives no figures."
+        "0.6 rad/s), which turns it on the slope. Slopes of 20 degrees begin after 1 m of level ground. A robot survives and "
+        "follows if it does not fall and is off its command by at most 0.15 m/s on the mean of the last 4 s. The second plant is "
+        "that of Figure 10; its loose joints have neither friction nor damping. The paper gives no figures."
     )
     plants: tuple[str, ...] = tuple(HARD_PLANTS)
     starts: tuple[str, ...] = tuple(STARTS)
