@@ -9,6 +9,7 @@ from quadvel_sim.terrain import perlin
 
 TERRAINS = {
     "flat": Terrain(),
+    "a ramp of 0 degrees": Terrain("slope", level=1.0),
     "uphill": Terrain("slope", slope=0.3),
     "downhill": Terrain("slope", slope=-0.2),
     "rough": Terrain("rough", size=8.0, seed=3),

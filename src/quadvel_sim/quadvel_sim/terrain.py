@@ -104,7 +104,7 @@ class Terrain:
     @property
     def is_grid(self) -> bool:
         """Whether the ground is a height field, not a plane."""
-        return self.kind == "rough" or self.level > 0.0
+        return self.kind == "rough" or (self.level > 0.0 and self.slope != 0.0)
 
     def _rise(self, x: Array, y: Array) -> Array:
         """Height of slope or ramp, m."""
