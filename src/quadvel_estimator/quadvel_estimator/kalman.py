@@ -32,8 +32,8 @@ from .odometry import foot_velocity_in_trunk, rolling_velocity
 
 SWING_SPEED_STD = 10.0  # m/s, standard deviation of the unknown speed of a foot in the air
 SPEED_CORRELATION_S = 1.0  # from the variance of a foot's speed to its random walk
-INITIAL_COVARIANCE = np.eye(5)  # (m/s)^2, 4 m^2
-_IDENTITY = np.eye(3)
+INITIAL_VARIANCE = 1.0  # (m/s)^2 of the velocity, m^2 of the feet
+_IDENTITY, _ONES = np.eye(3), np.ones(3)
 
 
 @attrs.frozen
@@ -112,10 +112,14 @@ class KalmanEstimator:
         """
         self._robot = robot
         self.config = config or KalmanConfig()
-        self._state = np.zeros((*shape, 5, 3))
-        self._covariance = np.zeros((*shape, 5, 5))
+        # The sixth row of state and covariance is the acceleration, an input of each sample.
+        self._state, self._covariance = np.zeros((*shape, 6, 3)), np.zeros((*shape, 6, 6))
+        self._initial_covariance = np.diag([INITIAL_VARIANCE] * 5 + [self.config.accelerometer**2])
+        self._transition = np.eye(5, 6)  # [F | G] of `_predict`
         self._speed_variance = np.zeros((*shape, 4))
-        self._transition, self._gain = np.eye(5), np.zeros(5)  # F and G of `_predict`
+        self._noise = np.full(
+            (*shape, 5), self.config.foot_position**2
+        )  # variances of what `_correct` measures
         self.reset()
 
     def reset(self, ids: Any = None) -> None:
@@ -129,7 +133,7 @@ class KalmanEstimator:
             self._time: float | None = None
         where = ... if ids is None else ids
         self._state[where] = 0.0
-        self._covariance[where] = INITIAL_COVARIANCE
+        self._covariance[where] = self._initial_covariance
         self._speed_variance[where] = SWING_SPEED_STD**2
 
     def update(self, state: RobotState, previous_action: ArrayLike | None = None) -> tuple[Array, Array]:
@@ -147,7 +151,9 @@ class KalmanEstimator:
             ValueError: Time went back.
             FloatingPointError: The result is not finite.
         """
-        return self._process(state.time, *self._measure(state))
+        rotation, *measured = self._measure(state)
+        self._process(state.time, *measured)
+        return self._result(rotation)
 
     def update_series(self, times: Sequence[float], states: RobotState) -> tuple[Array, Array]:
         """Process samples of one robot one after the other, faster than by `update`.
@@ -163,42 +169,49 @@ class KalmanEstimator:
             ValueError: Time went back.
             FloatingPointError: The result is not finite.
         """
-        measured = self._measure(states)
+        rotation, *measured = self._measure(states)
         for k, time in enumerate(times):
-            result = self._process(time, *(values[k] for values in measured))
-        return result
+            self._process(time, *(values[k] for values in measured))
+        return self._result(rotation[k])
 
     def _measure(self, state: RobotState) -> tuple[Array, ...]:
         """Return what does not depend on the past.
 
-        These are the rotation R (..., 3, 3), and in the world's axes: feet relative to the trunk,
-        velocity of rolling feet, and the trunk's velocity from each leg (..., 4, 3), trust in the
-        contact of each foot (..., 4), and the trunk's acceleration (..., 3).
+        These are the rotation R (..., 3, 3), and in the world's axes: the measured state (..., 5, 3),
+        whose first row, the velocity, is still empty; velocity of rolling feet (..., 4, 3); the
+        trunk's velocity from each leg, with a 1 after it (..., 4, 4); variance of the speed of feet
+        that are in the air (..., 4); and the trunk's acceleration (..., 3).
         """
         rotation = rotation_matrix(state.quaternion)
         feet, jacobians = foot_kinematics(self._robot, state.q)
         to_world = rotation.swapaxes(-1, -2)  # R^T, as vectors are rows: s_world = s_body R^T
         # With the foot s_i relative to the trunk, v = v_roll,i - d/dt (R s_i) for a planted foot.
         rolling = rolling_velocity(self._robot, state, rotation) @ to_world
-        leg_velocity = rolling - foot_velocity_in_trunk(state, feet, jacobians) @ to_world
-        trust = self._contact_trust(state, rotation, jacobians)
+        leg_velocity = np.ones((*feet.shape[:-1], 4))
+        leg_velocity[..., :3] = rolling - foot_velocity_in_trunk(state, feet, jacobians) @ to_world
+        measured = np.empty((*feet.shape[:-2], 5, 3))
+        measured[..., 1:, :] = feet @ to_world
+        swing_variance = (1.0 - self._contact_trust(state, rotation, jacobians)) * SWING_SPEED_STD**2
         acceleration = (rotation @ np.asarray(state.linear_acceleration)[..., None])[..., 0]
         acceleration[..., 2] -= GRAVITY
-        return rotation, feet @ to_world, rolling, leg_velocity, trust, acceleration
+        return rotation, measured, rolling, leg_velocity, swing_variance, acceleration
 
     def _process(
-        self, time: float, rotation: Array, feet: Array, rolling: Array, leg_velocity: Array, trust: Array,
+        self, time: float, measured: Array, rolling: Array, leg_velocity: Array, swing_variance: Array,
         acceleration: Array,
-    ) -> tuple[Array, Array]:  # fmt: skip
-        """Process the results of `_measure` at a time, s; returns what `update` returns."""
+    ) -> None:  # fmt: skip
+        """Process the results of `_measure` at a time, s."""
         dt = 0.0 if self._time is None else time - self._time
         if dt < 0.0:
             raise ValueError(f"state.time is {time}, expected {self._time} or later, or a reset")
         self._time = time
-        self._predict(acceleration, dt)
-        speed_variance = self._foot_speed_variance(leg_velocity, trust)
-        self._predict_feet(rolling, speed_variance, dt)
-        self._correct(feet, leg_velocity, speed_variance)
+        state, covariance = self._predict(acceleration, dt)
+        speed_variance = self._foot_speed_variance(state, covariance, leg_velocity, swing_variance)
+        self._predict_feet(state, covariance, rolling, speed_variance, dt)
+        self._correct(state, covariance, measured, leg_velocity, speed_variance)
+
+    def _result(self, rotation: Array) -> tuple[Array, Array]:
+        """Return what `update` returns."""
         velocity = (self._state[..., :1, :] @ rotation)[..., 0, :]
         if not np.isfinite(velocity).all():
             raise FloatingPointError("the Kalman filter's velocity is not finite")
@@ -212,33 +225,36 @@ class KalmanEstimator:
             force = _ground_force(state.tau, rotation, jacobians)
         return np.clip((force - self.config.contact_force) / self.config.contact_ramp, 0.0, 1.0)
 
-    def _predict(self, acceleration: Array, dt: float) -> None:
+    def _predict(self, acceleration: Array, dt: float) -> tuple[Array, Array]:
         """Predict the velocity and the feet relative to the trunk over `dt` (s).
 
-        v' = v + a dt,   r_i' = r_i - v dt - a dt^2 / 2
-        P' = F P F^T + sigma_a^2 G G^T,   G = (dt, -dt^2 / 2, ..., -dt^2 / 2)
+        v' = v + a dt,   r_i' = r_i - v dt - a dt^2 / 2, that is x' = F x + G a
+        P' = F P F^T + sigma_a^2 G G^T = [F | G] diag(P, sigma_a^2) [F | G]^T
         """
-        gain, transition = self._gain, self._transition
-        gain[0], gain[1:], transition[1:, 0] = dt, -0.5 * dt * dt, -dt
-        self._state = transition @ self._state + gain[:, None] * acceleration[..., None, :]
-        noise = gain[:, None] * gain * self.config.accelerometer**2
-        self._covariance = transition @ self._covariance @ transition.T + noise
+        transition = self._transition
+        transition[1:, 0], transition[0, 5], transition[1:, 5] = -dt, dt, -0.5 * dt * dt
+        self._state[..., 5, :] = acceleration
+        return transition @ self._state, transition @ self._covariance @ transition.T
 
-    def _foot_speed_variance(self, leg_velocity: Array, trust: Array) -> Array:
+    def _foot_speed_variance(
+        self, state: Array, covariance: Array, leg_velocity: Array, swing_variance: Array
+    ) -> Array:
         """Return the variance of each foot's unmodelled speed, (..., 4), (m/s)^2: swing, or slip on the ground.
 
         sigma^2 = P_vv + sigma_foot^2            (expected variance of v_leg - v)
         e = |v_leg - v|^2 / (3 gate^2 sigma^2)   (excess over the slip gate)
         result = sigma^2 max(e^2 - 1, 0) + (1 - trust) SWING_SPEED_STD^2
         """
-        expected_variance = self._covariance[..., 0, 0, None] + self.config.foot_velocity**2
-        deviation = np.square(leg_velocity - self._state[..., :1, :]).sum(-1) / 3.0
-        excess = deviation / (self.config.slip_gate**2 * expected_variance)
-        slip: Array = expected_variance * np.maximum(excess**2 - 1.0, 0.0)
-        return slip + (1.0 - trust) * SWING_SPEED_STD**2
+        expected_variance = covariance[..., :1, 0] + self.config.foot_velocity**2
+        difference = leg_velocity[..., :3] - state[..., :1, :]
+        excess = (difference * difference) @ (_ONES / (3.0 * self.config.slip_gate**2)) / expected_variance
+        slip: Array = expected_variance * np.maximum(excess * excess - 1.0, 0.0)
+        return slip + swing_variance
 
-    def _predict_feet(self, rolling: Array, speed_variance: Array, dt: float) -> None:
-        """Move the feet by rolling and add their random walk over `dt` (s).
+    def _predict_feet(
+        self, state: Array, covariance: Array, rolling: Array, speed_variance: Array, dt: float
+    ) -> None:
+        """Move the feet by rolling and add their random walk over `dt` (s), in place.
 
             r_i' = r_i + v_roll,i dt
             P_ii' = P_ii + (sigma_walk^2 + max(s_i before, s_i now) SPEED_CORRELATION_S) dt
@@ -246,32 +262,36 @@ class KalmanEstimator:
         The larger of the two speed variances counts: only a foot that is planted at both ends of
         `dt` stayed in place in between.
         """
-        self._state[..., 1:, :] += rolling * dt
+        state[..., 1:, :] += rolling * dt
         before, self._speed_variance = self._speed_variance, speed_variance
         walk = self.config.foot_walk**2 + np.maximum(before, speed_variance) * SPEED_CORRELATION_S
-        _diagonal(self._covariance)[..., 1:] += walk * dt
+        _diagonal(covariance)[..., 1:] += walk * dt
 
-    def _correct(self, feet: Array, leg_velocity: Array, speed_variance: Array) -> None:
+    def _correct(
+        self, state: Array, covariance: Array, measured: Array, leg_velocity: Array, speed_variance: Array
+    ) -> None:
         """Correct with the trunk velocity from the legs (z_0) and the feet (z_1..z_4).
 
         The four leg velocities enter as their weighted mean, w_i = 1 / (sigma_foot^2 + s_i), which
-        is equivalent to four measurements. The measurement is that of the whole state, H = I:
+        is equivalent to four measurements. The measurement is that of the whole state, H = I, with
+        the gain K = P S^-1 = I - R S^-1:
 
-            S = P + R,   K = P S^-1
-            x' = x + K (z - x),   P' = P - K P
+            S = P + R,   R = diag(1 / sum(w), sigma_r^2, ..., sigma_r^2)
+            x' = x + K (z - x) = z - R S^-1 (z - x),   P' = P - K P = R - R S^-1 R
         """
         weight = 1.0 / (self.config.foot_velocity**2 + speed_variance)
-        total = weight.sum(-1, keepdims=True)
-        mean = (weight[..., None, :] @ leg_velocity) / total[..., None]
-
-        innovation_covariance = self._covariance.copy()
-        diagonal = _diagonal(innovation_covariance)
-        diagonal[..., :1] += 1.0 / total
-        diagonal[..., 1:] += self.config.foot_position**2
-        gain = np.linalg.solve(innovation_covariance, self._covariance).swapaxes(-1, -2)
-        self._state = self._state + gain @ (np.concatenate([mean, feet], axis=-2) - self._state)
-        covariance = self._covariance - gain @ self._covariance
-        self._covariance = 0.5 * (covariance + covariance.swapaxes(-1, -2))
+        weighted = (weight[..., None, :] @ leg_velocity)[..., 0, :]  # of the velocities, and sum(w)
+        total, noise = weighted[..., 3:], self._noise
+        measured[..., 0, :] = weighted[..., :3] / total
+        noise[..., :1] = 1.0 / total
+        diagonal = _diagonal(covariance)
+        diagonal += noise
+        scaled = noise[..., None] * np.linalg.inv(covariance)  # R S^-1
+        self._state[..., :5, :] = measured - scaled @ (measured - state)
+        corrected = scaled * -noise[..., None, :]
+        diagonal = _diagonal(corrected)
+        diagonal += noise
+        self._covariance[..., :5, :5] = corrected
 
 
 def _diagonal(matrices: Array) -> Array:
