@@ -8,7 +8,7 @@ import attrs
 import numpy as np
 
 from quadvel_description.state import RobotState
-from quadvel_policy.backup_velocity import BATCH, BackupVelocity
+from quadvel_policy.backup_velocity import BATCH, THINNING, BackupVelocity
 
 REST = RobotState(
     0.0, 0, *np.zeros((3, 12)), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(3), np.zeros(4)
@@ -42,14 +42,24 @@ def _velocity(backup: BackupVelocity) -> float | None:
     return None if backup.velocity is None else float(backup.velocity[0])
 
 
-def test_states_wait_while_the_estimate_is_confirmed_and_none_is_lost() -> None:
+def test_states_wait_while_the_estimate_is_confirmed_and_some_are_skipped() -> None:
     filter = Clock()
     backup = BackupVelocity(filter)
     times = [0.01 * k for k in range(2 * BATCH + 1)]
     for time in times:
         _add(backup, [time])
         backup.confirm(np.zeros(3), TOLERANCE)
-    assert filter.batches == [times[:1], times[1 : BATCH + 1], times[BATCH + 1 :]]
+    step = slice(THINNING - 1, None, THINNING)
+    assert filter.batches == [times[:1], times[1 : BATCH + 1][step], times[BATCH + 1 :][step]]
+
+
+def test_no_state_is_skipped_while_the_velocity_is_needed() -> None:
+    filter = Clock()
+    backup = BackupVelocity(filter)
+    _add(backup, times := [0.01 * k for k in range(BATCH)])
+    backup.confirm(None, TOLERANCE)
+    _add(backup, more := [0.01 * k for k in range(BATCH, 2 * BATCH)])
+    assert [time for batch in filter.batches for time in batch] == times + more
 
 
 def test_an_estimate_that_is_missing_or_off_is_compared_with_the_newest_state() -> None:
