@@ -65,16 +65,27 @@ class JointCommandLimiter:
         if command.mode == MODE_DAMPING:
             return
         target = command.q
-        command.q, torque = split_target(self._robot, target, command.kp, state.q)
-        command.tau = command.tau + torque
-        self._count("target_out_of_range", np.count_nonzero(command.q != target) > 0)
+        command.q = clip_to_command_range(self._robot, target)
+        if np.count_nonzero(command.q != target):
+            command.q, torque = split_target(self._robot, target, command.kp, state.q)
+            command.tau = command.tau + torque
+            self.counts["target_out_of_range"] += 1
         requested = command.torque(state.q, state.dq)
+        if self._is_within_all(requested, before, state.dq):  # the usual case
+            return
         allowed = self._limit_step(requested, before)
         allowed = self._limit_torque(allowed)
         allowed = self._limit_at_top_speed(allowed, state.dq)
         allowed = self._limit_power(allowed, state.dq)
         if np.count_nonzero(allowed != requested):
             _add_torque(self._robot, command, allowed - requested)
+
+    def _is_within_all(self, torque: Array, before: Array, speed: Array) -> bool:
+        """Return whether surely no limit acts: sum(|tau| |dq|) is at least the power that counts."""
+        strength, speed = np.abs(torque), np.abs(speed)
+        within = np.abs(torque - before) <= self._config.max_torque_step
+        within &= (strength <= self._torque_limit) & (speed < self._velocity_limit)
+        return bool(np.count_nonzero(within) == 12 and strength @ speed <= self._config.max_power)
 
     def _count(self, name: str, acts: bool | np.bool_) -> None:
         if acts:

@@ -114,8 +114,12 @@ class Controller(Node):
         self.create_timer(WATCH_PERIOD_S, self._watch, clock=self.get_clock() if self._sim_time else steady)
         self.create_timer(1.0, self._report, clock=steady)
 
+    def _now_ns(self) -> int:
+        """Return the ROS time, ns; the system's time directly, as it is needed several times a tick."""
+        return int(self.get_clock().now().nanoseconds) if self._sim_time else time.time_ns()
+
     def _now(self) -> float:
-        return float(1e-9 * self.get_clock().now().nanoseconds)
+        return 1e-9 * self._now_ns()
 
     def _on_state(self, data: bytes) -> None:
         self._silent_reports = 0
@@ -156,7 +160,7 @@ class Controller(Node):
         self._loop.inputs.motors = Motors(temperature, np.array(message.dropped_out, bool))
 
     def _publish(self, answer: JointCommand) -> None:
-        stamp = divmod(self.get_clock().now().nanoseconds, 10**9)
+        stamp = divmod(self._now_ns(), 10**9)
         self._low_cmd.publish(encode_low_cmd(stamp, answer))
         self._log_changes()
 

@@ -213,16 +213,18 @@ class FootForceFrozen(Guard):
     modes = WALK_MODES
 
     def __init__(self) -> None:
-        self._time = np.zeros(4)
+        self._time = [0.0] * 4
 
     @override
     def check(self, data: GuardInput) -> str | None:
         if data.previous is None or not data.is_moving or data.mode != "walk":
-            self._time[:] = 0.0
+            self._time = [0.0] * 4
             return None
-        is_same = data.state.foot_force == data.previous.foot_force
-        self._time = np.where(is_same, self._time + data.gap, 0.0)
-        frozen = self._time > data.config.frozen_foot_time
-        for i in np.flatnonzero(frozen) if np.count_nonzero(frozen) else ():
-            return f"the force of foot {LEGS[i]} has stayed at {data.state.foot_force[i]:.0f} N for {self._time[i]:.1f} s"
-        return None
+        forces = data.state.foot_force.tolist()
+        pairs = zip(self._time, forces, data.previous.foot_force.tolist(), strict=True)
+        self._time = [time + data.gap if force == before else 0.0 for time, force, before in pairs]
+        longest = max(self._time)
+        if longest <= data.config.frozen_foot_time:
+            return None
+        i = self._time.index(longest)
+        return f"the force of foot {LEGS[i]} has stayed at {forces[i]:.0f} N for {longest:.1f} s"
