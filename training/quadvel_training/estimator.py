@@ -57,9 +57,11 @@ class VelocityNetwork(Recurrent):
         self.layout = layout
         with torch.no_grad():
             self.body[-1].bias[-1] = INITIAL_INERTIA_LOGIT
-        spin = torch.linalg.cross(*torch.broadcast_tensors(torch.eye(3)[:, None], torch.eye(3)))
-        # w @ spin is the matrix of b -> w x b for row vectors
-        self.register_buffer("spin", spin.reshape(3, 9), persistent=False)
+        # Both are linear in the input, so one product computes them: their map has the image of each unit vector.
+        units = torch.eye(features.INPUT_SIZE)
+        maps = torch.cat([self._velocities(units), self._turn(units)], dim=-1)
+        self.register_buffer("maps", maps, persistent=False)
+        self.register_buffer("offset", torch.cat([torch.zeros(15), torch.eye(3).flatten()]), persistent=False)
 
     def initial_state(self, n: int) -> State:
         """Return the zero memory, at rest.
@@ -87,26 +89,29 @@ class VelocityNetwork(Recurrent):
         y, (hidden, memory) = self.lstm(x, (h[0].contiguous(), c[0].contiguous()))
         correction, log_variance, logits = self.body(torch.nn.functional.silu(y)).split([3, 3, 5], dim=-1)
         share = logits.softmax(-1)
-        legs, keep = (
-            (share[..., :4, None] * self._quantity(x, "leg_velocity").unflatten(-1, (4, 3))).sum(-2),
-            share[..., 4:],
-        )
-        # v[k] = s_0 (v[k-1] + dt (a + g - w x v[k-1])) + sum_i s_i v_leg_i + correction
-        # with shares s = softmax(logits) of inertia and of the four legs, specific force a, gravity
-        # g and
-        # angular velocity w in the body frame
-        gained = TICK_S * (self._quantity(x, "linear_acceleration") + GRAVITY * self._quantity(x, "gravity"))
-        # for rows: v - dt w x v = v (1 - dt [w]x)
-        turn = torch.eye(3) - TICK_S * (self._quantity(x, "angular_velocity") @ self.spin).unflatten(
-            -1, (3, 3)
-        )
-        carried, added = keep[..., None] * turn, keep * gained + legs + correction
-        velocity, track = h[1][0], []
+        # v[k] = sum_i s_i v_leg_i + s_4 (v[k-1] + dt (a + g - w x v[k-1])) + correction
+        # with shares s = softmax(logits) of the four legs and of inertia, specific force a, gravity g
+        # and angular velocity w in the body frame. For row vectors, v - dt w x v = v (1 - dt [w]x).
+        known, turn = torch.nn.functional.linear(x, self.maps.T, self.offset).split([15, 9], dim=-1)
+        velocities = known.reshape(*x.shape[:-1], 5, 3)
+        added = share[..., None, :] @ velocities + correction[..., None, :]
+        carried = share[..., 4:, None] * turn.reshape(*x.shape[:-1], 3, 3)
+        row, track = h[1].transpose(0, -2), []
         for k in range(x.shape[0]):
-            velocity = (velocity[..., None, :] @ carried[k])[..., 0, :] + added[k]
-            track.append(velocity)
-        output = torch.cat([torch.stack(track), log_variance], dim=-1)
-        return output, (torch.cat([hidden, velocity[None]], dim=-1), torch.cat([memory, c[1]], dim=-1))
+            row = row @ carried[k] + added[k]
+            track.append(row)
+        output = torch.cat([torch.stack(track).squeeze(-2), log_variance], dim=-1)
+        return output, (torch.cat([hidden, row.transpose(0, -2)], dim=-1), torch.cat([memory, c[1]], dim=-1))
+
+    def _velocities(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the velocity from each leg, and what inertia adds, dt (a + g); (..., 15), m/s."""
+        felt = self._quantity(x, "linear_acceleration") + GRAVITY * self._quantity(x, "gravity")
+        return torch.cat([self._quantity(x, "leg_velocity"), TICK_S * felt], dim=-1)
+
+    def _turn(self, x: torch.Tensor) -> torch.Tensor:
+        """Return -dt [w]x, row by row, (..., 9): the matrix of v -> -dt w x v for row vectors."""
+        spin = torch.linalg.cross(*torch.broadcast_tensors(torch.eye(3)[:, None], torch.eye(3)))
+        return -TICK_S * self._quantity(x, "angular_velocity") @ spin.reshape(3, 9)
 
     def _quantity(self, x: torch.Tensor, name: str) -> torch.Tensor:
         """Extract a quantity from the network input (..., 69), in its unit, up to clipping."""
