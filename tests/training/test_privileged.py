@@ -315,6 +315,22 @@ def test_a_robot_is_behind_by_what_its_plan_moved_farther_until_it_stands():
     assert not past.lag.any()
 
 
+def test_the_way_behind_stays_where_it_is_in_the_world_while_the_robot_turns():
+    env = VelocityEnv(CALM)
+    past, command = Past(env), np.tile([0.0, 0.0, 2.0, 0.0], (4, 1))
+    past.clock.velocity[:], env.velocity[:], env.angular_velocity[:] = command[:, :3], 0.0, [0.0, 0.0, 2.0]
+    past.lag[:] = behind = [0.08, -0.05, 0.0]
+    seconds = 0.4
+    for _ in range(round(seconds / env.config.period)):
+        past.advance(command)
+    c, s = (
+        np.cos(2.0 * seconds),
+        np.sin(2.0 * seconds),
+    )  # the body turns to the left, the way in it to the right
+    there = [c * behind[0] + s * behind[1], c * behind[1] - s * behind[0], 0.0]
+    assert past.lag == pytest.approx(np.tile(there, (4, 1)), abs=2e-3)  # integrated with 20 ms
+
+
 def test_a_velocity_counts_as_steady_once_the_plan_has_reached_it_and_ends_with_a_new_command():
     env = VelocityEnv(CALM)
     past, command = Past(env), np.tile([1.0, 0.2, 0.5, 0.0], (4, 1))

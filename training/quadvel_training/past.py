@@ -29,8 +29,8 @@ class Past:
             `STRIDE_S`.
         lasting: (n, 3), the same over `LASTING_S`; set to zero by a new command, it changes while
             the robot is `settled`.
-        lag: (n, 3), m, m, rad, how far the robot is behind its plan: the integral of planned velocity
-            minus velocity in the body frame, over all commands; 0 while it stands.
+        lag: (n, 3), m, m, rad, body frame, how far the robot is behind its plan: the way from where it
+            is to where planned velocities would have taken it, over all commands; 0 while it stands.
         air: (n, 4), s since the foot left the ground; 0 on the ground.
         down: (n, 4), s since the foot touched the ground; 0 in the air.
         clock: plan of the steps.
@@ -89,9 +89,13 @@ class Past:
         self.steady += (reached[:, 0] - self.steady) * period / taking
         settled = self.settled[:, None]
         self.lasting += (error - self.lasting) * settled * period / LASTING_S
-        # l <- l + (v_planned - v) dt, within MAX_LAG; 0 for a robot that stands
-        behind = (self.clock.velocity - env.planar_velocity) * period
-        self.lag = np.clip(self.lag + behind, -MAX_LAG, MAX_LAG)
+        # l <- l + (v_planned - v - w x l) dt, within MAX_LAG; 0 for a robot that stands. The way stays
+        # where it is in the world while the body turns by w; y follows the new x, so that its length stays.
+        turn = env.angular_velocity[:, 2] * period
+        self.lag += (self.clock.velocity - env.planar_velocity) * period
+        self.lag[:, 0] += turn * self.lag[:, 1]
+        self.lag[:, 1] -= turn * self.lag[:, 0]
+        self.lag = np.clip(self.lag, -MAX_LAG, MAX_LAG)
         self.lag[self.standing & (command[:, 3] > 0.5)] = 0.0
         self.lasting[env.changed] = 0.0
         self._age[env.changed] = 0.0
