@@ -13,7 +13,7 @@ from .gait_clock import GaitClock
 STRIDE_S = 0.35  # time constant of stride errors: about a stride
 LASTING_S = 1.5  # time constant of lasting errors
 MAX_LAG = 0.2  # m, m, rad: a robot that does not follow is not to make up for more later
-CATCH_UP_TURN = 2.0  # 1/s: this times the angle that a robot lags behind is added to its teacher's yaw rate
+CATCH_UP_TURN = 1.0  # 1/s: this times the angle that a robot lags behind is added to its teacher's yaw rate
 TRANSIENT_S = 1.0  # after the plan has reached a command, not part of lasting errors and scores
 STEADY_S = 0.5  # time constant with which a velocity that the plan has reached counts as steady,
 STEADY_END_S = 0.1  # and with which it ceases to under a new command
@@ -30,7 +30,7 @@ class Past:
         lasting: (n, 3), the same over `LASTING_S`; set to zero by a new command, it changes while
             the robot is `settled`.
         lag: (n, 3), m, m, rad, body frame, how far the robot is behind its plan: the way from where it
-            is to where planned velocities would have taken it, over all commands; 0 while it stands.
+            is to where planned velocities would have taken it, over all commands; 0 once it is to stand.
         air: (n, 4), s since the foot left the ground; 0 on the ground.
         down: (n, 4), s since the foot touched the ground; 0 in the air.
         clock: plan of the steps.
@@ -89,14 +89,14 @@ class Past:
         self.steady += (reached[:, 0] - self.steady) * period / taking
         settled = self.settled[:, None]
         self.lasting += (error - self.lasting) * settled * period / LASTING_S
-        # l <- l + (v_planned - v - w x l) dt, within MAX_LAG; 0 for a robot that stands. The way stays
+        # l <- l + (v_planned - v - w x l) dt, within MAX_LAG; 0 for a robot that is to stand. The way stays
         # where it is in the world while the body turns by w; y follows the new x, so that its length stays.
         turn = env.angular_velocity[:, 2] * period
         self.lag += (self.clock.velocity - env.planar_velocity) * period
         self.lag[:, 0] += turn * self.lag[:, 1]
         self.lag[:, 1] -= turn * self.lag[:, 0]
         self.lag = np.clip(self.lag, -MAX_LAG, MAX_LAG)
-        self.lag[self.standing & (command[:, 3] > 0.5)] = 0.0
+        self.lag[command[:, 3] > 0.5] = 0.0
         self.lasting[env.changed] = 0.0
         self._age[env.changed] = 0.0
         self._advance_stances()
