@@ -77,7 +77,9 @@ def test_a_replay_is_the_same_of_every_kind_of_recording(tmp_path: Path) -> None
     """With stamps and without, from this stack's messages, a Go2's, and JointState in another order of the legs."""
     whole = replayed(rosbag2(tmp_path / "own", own(())))
     assert replayed(rosbag2(tmp_path / "zeros", own(range(ROWS)))) == pytest.approx(whole, abs=1e-3)
-    assert replayed(rosbag2(tmp_path / "go2", go2())) == pytest.approx(whole, abs=1e-3)
+    others = rosbag2(tmp_path / "go2", go2())
+    assert replayed(others, "--robot", "aliengo") == pytest.approx(whole, abs=1e-3)
+    assert replayed(others) == replayed(others, "--robot", "go2")
     pair = joint_states(JOINT_NAMES, commanded=ORDERED)
     assert replayed(rosbag2(tmp_path / "pair", pair), "--gains", 30, 0.5) == pytest.approx(whole, abs=1e-3)
 

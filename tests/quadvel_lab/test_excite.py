@@ -156,3 +156,19 @@ def test_without_a_robot_it_says_what_to_start_and_ends_with_2(
     assert "quadvel run driver" in message
     assert "ROS_DOMAIN_ID" in message
     assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["chirp", "--low-level", "external", "--seed", "5"], "--seed: only a simulated robot has this"),
+        (["chirp", "--after", "report.json"], "found the motion chirp and --after"),
+    ],
+)
+def test_options_that_contradict_are_refused(
+    arguments: list[str], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended, exit_with_sentence("quadvel"):
+        cli.command("excite").main(arguments)
+    assert ended.value.code == 2
+    assert named in capsys.readouterr().err

@@ -279,6 +279,13 @@ def test_lost_states_are_no_jump_of_the_angle(run: Run) -> None:
     assert np.abs(jumps).max() <= np.abs(whole).max()
 
 
+def test_states_that_were_taken_late_together_are_no_jump_of_the_angle(run: Run) -> None:
+    time = run.time.copy()
+    time[200] = time[201] - 3e-5  # the computer was busy
+    late = attrs.evolve(run, time=time)
+    assert np.abs(Signals(late, None).jumps[200]).max() <= np.abs(Signals(run, None).jumps).max()
+
+
 def headline(run: Run, modes: list[str], faults: list[str]) -> str:
     """The first line of the answer for a run with these reports of the controller."""
     reported = attrs.evolve(run, modes=Modes(np.arange(len(modes)) * 0.1, tuple(modes), tuple(faults)))

@@ -141,11 +141,11 @@ class ActuatorParameters:
         )
 
     @classmethod
-    def load(cls, robot: Robot, path: str | Path, some_joints: bool = False) -> ActuatorParameters:
+    def load(cls, robot: Robot | None, path: str | Path, some_joints: bool = False) -> ActuatorParameters:
         """Read a parameter file.
 
         Args:
-            robot: The robot that the file has to belong to.
+            robot: The robot that the file has to belong to; None: any.
             path: YAML file.
             some_joints: Whether it may hold some joints only.
 
@@ -158,8 +158,9 @@ class ActuatorParameters:
         """
         content = read_yaml(Path(path), "a YAML file of actuator parameters")
         parameters = structure_record(cls, content, Path(path))
-        if parameters.robot != robot.name:
-            raise ValueError(f"{path}: {refusal(cls, 'robot', parameters.robot, repr(robot.name))}")
+        if robot is not None and parameters.robot != robot.name:
+            found = refusal(cls, "robot", parameters.robot, repr(robot.name))
+            raise ValueError(f"{path}: {found}: identify the logs with --robot {robot.name}")
         if not some_joints and len(names := parameters.joints or JOINT_NAMES) != len(JOINT_NAMES):
             raise ValueError(
                 f"{path}: joints: found {len(names)} ({', '.join(names)}), expected all {len(JOINT_NAMES)} of the "

@@ -12,6 +12,7 @@ The folder of a robot, `robots/<name>` or one elsewhere, holds
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -79,16 +80,24 @@ def is_robot(chosen: str) -> bool:
     return chosen in shipped_robots() or Path(chosen).suffix == ".yaml" or Path(chosen).is_dir()
 
 
-def robot_of_file(path: Path, named: str | None, asked: str | None) -> Robot:
+def robot_of_file(
+    path: Path,
+    named: str | None,
+    asked: str | None,
+    assumed: str = UNNAMED_ROBOT,
+    notify: Callable[[str], None] | None = None,
+) -> Robot:
     """Load the robot of a recording or another file.
 
     Args:
         path: The file.
         named: Name of the robot in the file, or None.
         asked: Name or file of the robot that was asked for, or None for that of the file.
+        assumed: Name of the robot if the file names none and none was asked for.
+        notify: Called with one sentence if the robot is assumed.
 
     Returns:
-        The robot that was asked for, else the one that the file names, else UNNAMED_ROBOT.
+        The robot that was asked for, else the one that the file names, else the assumed one.
 
     Raises:
         ValueError: The file names another robot than the one that was asked for.
@@ -99,7 +108,10 @@ def robot_of_file(path: Path, named: str | None, asked: str | None) -> Robot:
             raise FileNotFoundError(
                 f"{path}: its robot is {named!r}, which is not shipped: name its folder by --robot"
             )
-        return load_robot(named or UNNAMED_ROBOT)
+        robot = load_robot(named or assumed)
+        if notify and not named:
+            notify(f"robot: the file names none, {robot.title} is assumed: --robot chooses another")
+        return robot
     robot = load_robot(asked)
     if named not in (None, robot.name):
         raise ValueError(f"{path}: robot is {named!r}, expected {robot.name!r}")

@@ -21,7 +21,7 @@ from rich.table import Table
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.arrays import Array
 from quadvel_description.quadruped import JOINT_NAMES
-from quadvel_description.robot import Robot, robot_of_file
+from quadvel_description.robot import Robot
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import LearnedEstimator
@@ -253,7 +253,7 @@ def replay_command(
             f"--estimator-file: found {estimator_file} with --estimator {estimator}, expected learned"
         )
     run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording), robot)
-    chosen = robot_of_file(recording, None if run.robot is None else run.robot.name, robot)
+    chosen = run.robot
     model = ActuatorParameters.of(chosen) if actuator is None else ActuatorParameters.load(chosen, actuator)
     asked = LearnedEstimator(chosen, estimator_file) if estimator == "learned" else KalmanEstimator(chosen)
     if run.foreign_log is None:

@@ -21,10 +21,10 @@ from matplotlib.patches import Patch
 from quadvel_description.arrays import Array
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot, load_robot, robot_of_file
-from quadvel_description.robot_name import described_robot
-from quadvel_recordings.joint_log import JointLog, read_joint_log
+from quadvel_description.robot_name import UNNAMED_ROBOT, described_robot
+from quadvel_recordings.joint_log import JointLog, read_joint_log, robot_of_types
 from quadvel_recordings.output import atomic_write, output_folder
-from quadvel_recordings.reading import RecordingError, read_messages, recorded_description
+from quadvel_recordings.reading import RecordingError, read_messages, recorded_description, topics
 from quadvel_recordings.stamps import missing_stamp_notices, stamp_of
 
 from .demo_figures import AXIS_LABELS
@@ -81,20 +81,20 @@ class RecordedRun:
         series: Times since `begin` (n,), s, and values (n, k) of each recorded topic.
         modes: Start (s) and name of each mode of the controller, in order.
         end: Last time of all topics, s since `begin`.
+        robot: The robot: that asked for, else that of the recording, else an assumed one.
         joints: Joints of the series of low_state, which holds their angles, then their torques.
         uses_receipt_times: Whether times of receipt replace missing stamps.
         foreign_log: Joint log of another robot, if the joints come from one.
-        robot: The robot that the recording names.
     """
 
     begin: float
     series: Mapping[str, tuple[Array, Array]]
     modes: list[tuple[float, str]]
     end: float
+    robot: Robot
     joints: Sequence[str] = JOINT_NAMES
     uses_receipt_times: bool = False
     foreign_log: JointLog | None = None
-    robot: Robot | None = None
 
 
 @attrs.define
@@ -159,10 +159,11 @@ def read_recorded_run(
     changes = [k for k, mode in enumerate(loop.modes) if not k or loop.modes[k - 1] != mode]
     modes = [(float(loop.clock(received)[k]) - begin, loop.modes[k]) for k in changes]
     ends = max(float(times[-1]) for times, _ in lines.values())
-    if foreign:
-        return RecordedRun(begin, lines, modes, ends, foreign.state.joints, received, foreign)
-    robot = robot_of_file(path, described_robot(recorded_description(path)), asked)
-    return RecordedRun(begin, lines, modes, ends, JOINT_NAMES, received, None, robot)
+    joints = foreign.state.joints if foreign else JOINT_NAMES
+    likely = robot_of_types(topics(path).values()) or UNNAMED_ROBOT
+    notify = warn if set(joints) & set(JOINT_NAMES) else None
+    robot = robot_of_file(path, described_robot(recorded_description(path)), asked, likely, notify)
+    return RecordedRun(begin, lines, modes, ends, robot, joints, received, foreign)
 
 
 def _read_topics(path: Path, warn: Callable[[str], None] | None) -> dict[str, _Topic]:
@@ -260,7 +261,7 @@ def joints_figure(run: RecordedRun) -> Figure | None:
 
 
 def torques_figure(run: RecordedRun) -> Figure | None:
-    """Plot the torque of each joint, with the limits of a robot of this stack.
+    """Plot the torque of each joint, with the limits of the robot's own joints.
 
     Args:
         run: The run.
@@ -274,8 +275,8 @@ def torques_figure(run: RecordedRun) -> Figure | None:
     figure, panels = joint_panels(run)
     for joint, (name, panel) in enumerate(zip(run.joints, panels.ravel(), strict=False)):
         panel.plot(time, numbers[:, len(run.joints) + joint], color="tab:blue", lw=0.6, label="measured")
-        if run.robot is not None:
-            limit = run.robot.torque_limit[joint]
+        if name in JOINT_NAMES:
+            limit = run.robot.torque_limit[JOINT_NAMES.index(name)]
             panel.axhline(limit, color="tab:red", lw=0.8, ls="--", label="limit")
             panel.axhline(-limit, color="tab:red", lw=0.8, ls="--")
         panel.set_title(f"{name.removesuffix('_joint')}, N m", fontsize="small", loc="left")

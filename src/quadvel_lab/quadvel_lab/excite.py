@@ -231,11 +231,19 @@ def excite_command(
     """
     console = Console(soft_wrap=True)
     if after is not None:
+        if motion is not None:
+            raise ValueError(
+                f"found the motion {motion} and --after, which proposes motions: expected one of both"
+            )
         _print_proposals(after, console)
         return
     if motion not in EXCITATIONS:
         found = "no motion given" if motion is None else f"motion is '{motion}'"
         raise ValueError(f"{found}, expected one of {', '.join(EXCITATIONS)}")
+    simulated = {"--actuator": actuator is not None, "--seed": seed != 0}
+    if low_level != "sim" and any(simulated.values()):
+        named = ", ".join(name for name, is_given in simulated.items() if is_given)
+        raise ValueError(f"{named}: only a simulated robot has this, not --low-level {low_level}")
     chosen = load_robot(robot)
     excitation = EXCITATIONS[motion](chosen, **({} if seconds is None else {"seconds": seconds}))
     path = out or Path("out/excite") / f"{motion}.mcap"

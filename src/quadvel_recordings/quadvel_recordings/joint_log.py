@@ -44,6 +44,18 @@ LOW_RATE_TOPIC_PATTERN = re.compile(r"(^|/)lf/")
 """Pattern of the topics on which Unitree repeats the states at a lower rate."""
 
 
+def robot_of_types(typenames: Iterable[str]) -> str | None:
+    """Return the robot that message types suggest, if a recording names none.
+
+    Args:
+        typenames: Type names of its topics.
+
+    Returns:
+        "go2" for types of `unitree_go`, else None.
+    """
+    return "go2" if any(name.startswith("unitree_go/") for name in typenames) else None
+
+
 def _own_state(m: Any) -> tuple[Names, Array]:
     """Return joint names and q, dq, tau (3, 12) of a quadvel LowState."""
     return LEG_JOINTS, np.array([m.q, m.dq, m.tau])

@@ -23,7 +23,6 @@ from typing_extensions import override
 
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description.robot import is_robot, load_robot
-from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_recordings.output import output_folder
 
 from .logs.check_log import CheckedLog, check_logs
@@ -132,8 +131,9 @@ def identify(
         str | None,
         typer.Option(
             metavar="<name|file>",
-            help="The robot, aliengo, go2 or its folder, or an MJCF or URDF file; its legs replay the commands before and after.",
-            show_default="no replay",
+            help="The robot, aliengo, go2 or its folder: limits of actuator.yaml, legs that replay the commands before and "
+            "after. An MJCF or URDF file: replay alone.",
+            show_default="that of the recording or of --base, without replay",
         ),
     ] = None,
     state_topic: Annotated[
@@ -189,11 +189,12 @@ def identify(
         return_freed_arrays_to_system()
         names = ColumnMap() if columns is None else ColumnMap.load(columns)
         kind = robot if robot is not None and is_robot(robot) else None
-        topics = Topics(state_topic, command_topic)
-        read = partial(read_log, joints=joints, names=names, topics=topics, robot=kind)
         parameters = None
         if base is not None:
-            parameters = ActuatorParameters.load(load_robot(kind or DEFAULT_ROBOT), base, some_joints=True)
+            parameters = ActuatorParameters.load(load_robot(kind) if kind else None, base, some_joints=True)
+            kind = kind or parameters.robot
+        topics = Topics(state_topic, command_topic)
+        read = partial(read_log, joints=joints, names=names, topics=topics, robot=kind)
         options = IdentifyOptions(gains=gains, base=parameters, robot=robot)
         found = _identify(logs, holdout or [], read, options, cores, messages)
         _write(found, out, force, messages)

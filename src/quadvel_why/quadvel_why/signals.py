@@ -168,11 +168,18 @@ class Signals:
 
     @cached_property
     def jumps(self) -> Array:
-        """Change of each angle that its speeds do not explain, (n - 1, J), rad; 0 across lost states."""
+        """Change of each angle that its speeds do not explain, (n - 1, J), rad; 0 across lost states.
+
+        States that a busy computer took late together have stamps that are closer than their samples:
+        what a whole period explains is no jump.
+        """
         run = self.run
         dt = np.diff(run.time)[:, None]
         # dq_mean = (dq[i] + dq[i+1]) / 2 says little of a gap, in which the speed may turn round
-        unexplained = np.diff(run.q, axis=0) - 0.5 * dt * (run.dq[1:] + run.dq[:-1])
+        change, mean = np.diff(run.q, axis=0), 0.5 * (run.dq[1:] + run.dq[:-1])
+        unexplained, in_a_period = change - dt * mean, change - run.period * mean
+        is_late = (dt < run.period) & (np.abs(in_a_period) < np.abs(unexplained))
+        unexplained = np.where(is_late, in_a_period, unexplained)
         return np.asarray(
             np.where(np.isfinite(unexplained) & (dt > GAP_PERIODS * run.period), 0.0, unexplained)
         )

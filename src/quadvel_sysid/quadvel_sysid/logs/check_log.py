@@ -53,11 +53,13 @@ def check_log(log: Log, gains: tuple[float, float] | None = None) -> CheckedLog:
     Returns:
         The corrected log and the findings.
     """
+    held = [name for name in ("kp", "kd") if getattr(log, name) is not None]
     unused = log.holds_other_gains(gains)
     log = log.with_gains(gains)
     findings = [Finding("note", text.partition(":")[0], (), text) for text in log.remarks]
     if unused:
-        findings.append(Finding("warning", "kp", (), "kp, kd: the log holds them, so --gains is not used"))
+        why = "them, so --gains is not used" if len(held) == 2 else "it, so --gains is not used for it"
+        findings.append(Finding("warning", "kp", (), f"{', '.join(held)}: the log holds {why}"))
     findings += [Finding("warning", text.partition(":")[0], (), text) for text in log.warnings]
     for check in ROW_CHECKS:
         log = _run_check(check, findings, log)

@@ -180,14 +180,10 @@ class Log:
             gains: kp (N m/rad) and kd (N m s/rad), or None.
 
         Returns:
-            True if the log has both gains, and at least one differs from the given one.
+            True if the log has a gain that differs from the given one.
         """
-        logged = (self.kp, self.kd)
-        return (
-            gains is not None
-            and all(one is not None for one in logged)
-            and any(np.any(one != gain) for one, gain in zip(logged, gains, strict=True))
-        )
+        pairs = zip((self.kp, self.kd), gains or (), strict=False)
+        return any(own is not None and bool(np.any(own != gain)) for own, gain in pairs)
 
     def with_gains(self, gains: tuple[float, float] | None) -> Log:
         """Fill in the commanded gains that the log does not hold.

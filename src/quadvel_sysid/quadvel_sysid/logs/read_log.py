@@ -7,9 +7,12 @@ from pathlib import Path
 
 import attrs
 
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import robot_of_file
-from quadvel_description.robot_name import described_robot
+from quadvel_description.robot_name import UNNAMED_ROBOT, described_robot
+from quadvel_recordings.joint_log import robot_of_types
 from quadvel_recordings.reading import recorded_description
+from quadvel_recordings.reading import topics as recorded_topics
 
 from .log import Log, LogError
 from .readers import lerobot
@@ -45,13 +48,23 @@ def read_log(
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
+    named, likely = None, UNNAMED_ROBOT
+    warnings: list[str] = []
     if path.suffix in (".mcap", ".db3", ".bag") or (path.is_dir() and lerobot.find_root(path) != path):
         log = read_recording(path, topics or Topics())
         named = described_robot(recorded_description(path))
+        likely = robot_of_types(recorded_topics(path).values()) or UNNAMED_ROBOT
+        if names and (names.sources or names.joints):
+            warnings = ["--columns: not used, as this is a recording, whose messages name their fields"]
     else:
-        log, named = read_table(path, names or ColumnMap()), None
+        log = read_table(path, names or ColumnMap())
+        if topics and (topics.state or topics.command):
+            warnings = ["--state-topic, --command-topic: not used, as this is a table, which has no topics"]
+    remarks = list(log.remarks)
+    notify = remarks.append if set(log.joints) & set(JOINT_NAMES) else None
     try:
-        log = attrs.evolve(log, robot=robot_of_file(path, named, robot))
+        found = robot_of_file(path, named, robot, likely, notify)
     except ValueError as error:
         raise LogError(str(error)) from None
+    log = attrs.evolve(log, robot=found, remarks=tuple(remarks), warnings=(*log.warnings, *warnings))
     return log if joints is None else log.select_joints(joints)

@@ -134,6 +134,8 @@ def _member_header(path: Path, archive: zipfile.ZipFile, name: str, field: str) 
             raise LogError(f"{path}: {name}: no NumPy array: {error}") from None
     if min(shape, default=0) < 0:
         raise LogError(f"{path}: {name}: found shape {shape}, expected no length below 0")
+    if dtype.hasobject:
+        raise LogError(f"{path}: {name}: found the type object, expected numbers: {unpickled(path)}")
     check_type(path, name, dtype, field)
     if field == JOINT_NAMES_FIELD and math.prod(shape) * dtype.itemsize > MAX_LINE_CHARS:
         raise LogError(f"{path}: {name}: found {shape} names, expected one a joint")

@@ -18,6 +18,7 @@ A map file is YAML with one line for each field that has another name:
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -48,6 +49,14 @@ def _is_numeric(value: Any) -> bool:
     """Whether a value of YAML is a number or a list of numbers."""
     values = value if isinstance(value, list) else [value]
     return all(isinstance(one, (int, float)) and not isinstance(one, bool) for one in values)
+
+
+def _yaml_number(value: Any) -> Any:
+    """Convert texts such as 1e-6, which YAML 1.1 takes for no numbers, alone or in a list."""
+    if isinstance(value, list):
+        return [_yaml_number(one) for one in value]
+    is_number = isinstance(value, str) and re.fullmatch(r"[-+]?\d+\.?\d*[eE][-+]?\d+", value)
+    return float(value) if is_number else value
 
 
 @attrs.frozen
@@ -86,7 +95,8 @@ class Source:
         _check_keys(entry, ("from", "scale", "value", "file"), f"{where}/")
         names = entry.get("from")
         names = names if isinstance(names, list) else [] if names is None else [names]
-        scale, value, file = entry.get("scale"), entry.get("value"), entry.get("file")
+        scale, value = _yaml_number(entry.get("scale")), _yaml_number(entry.get("value"))
+        file = entry.get("file")
         for field, good, expected in (
             ("from", all(isinstance(name, str) for name in names), "a name or a list of names"),
             ("scale", scale is None or _is_numeric(scale), "a number, or one for each joint"),
@@ -181,7 +191,7 @@ def read_fields(path: Path, names: ColumnMap) -> tuple[dict[str, Floats], list[s
                 fields[name] = np.asarray(source.value, dtype=float)
             elif source.columns:
                 columns, own = _mapped_columns(place, name, source.columns, raw, joints)
-                fields[name] = _stack_columns(place, name, columns, raw, source.scale)
+                fields[name] = _stack_columns(place, name, columns, raw, source.scale, remarks)
                 joints = joints or (own if name == "q" else None)
         if is_log_file:
             joints = _add_unmapped(place, raw, names, fields, joints, remarks)
@@ -232,7 +242,7 @@ def _add_unmapped(
         if own:
             joints, ordered = _in_order(path, field, own, joints)
             columns = {joint: columns[joint] for joint in ordered}
-        fields[field] = _stack_columns(path, field, list(columns.values()), raw, None, own != [])
+        fields[field] = _stack_columns(path, field, list(columns.values()), raw, None, remarks, own != [])
         used |= set(columns.values())
     others = [
         name
@@ -284,10 +294,15 @@ def _stack_columns(
     columns: Sequence[str],
     raw: RawArrays,
     scale: float | list[float] | None,
+    remarks: list[str],
     of_joints: bool = False,
 ) -> Floats:
-    """Stack columns to one array in SI units."""
-    parts = [raw.arrays[name] * _unit_factor(path, name, raw.units.get(name), scale) for name in columns]
+    """Stack columns to one array in SI units; add a remark if the file states another unit."""
+    factors = [_unit_factor(path, name, raw.units.get(name), scale) for name in columns]
+    parts = [raw.arrays[name] * factor for name, factor in zip(columns, factors, strict=True)]
+    converted = {raw.units[name] for name, factor in zip(columns, factors, strict=True) if factor != 1.0}
+    if converted:
+        remarks.append(f"{field}: converted from {format_names(sorted(converted))}, the unit in the file")
     values = np.stack(parts, 1) if len(columns) > 1 or of_joints else parts[0]
     if scale is not None:
         values = values * np.asarray(scale)
