@@ -44,9 +44,11 @@ NODES = {
         "quadvel_sim.sim_node", "the simulated robot: MuJoCo behind low_state and low_cmd", "sim"
     ),
     "board": NodeEntry(
-        "quadvel_sim.board_node", "the same robot behind the UDP interface of the AlienGo", "sim"
+        "quadvel_sim.board_node", "the same robot behind the network interface of its board", "sim"
     ),
-    "driver": NodeEntry("quadvel_driver.driver", "the real AlienGo: its UDP interface and its remote"),
+    "driver": NodeEntry(
+        "quadvel_driver.driver", "the real robot (-p robot:=aliengo or go2): its board and its remote"
+    ),
     "estimator": NodeEntry("quadvel_estimator.estimator", "estimates linear velocity from IMU and encoders"),
     "controller": NodeEntry("quadvel_policy.controller", "runs the policy at 200 Hz, its modes and guards"),
     "command_mux": NodeEntry("quadvel_policy.command_mux_node", "selects a velocity source by priority"),

@@ -161,7 +161,7 @@ def read_recorded_run(
     ends = max(float(times[-1]) for times, _ in lines.values())
     joints = foreign.state.joints if foreign else JOINT_NAMES
     likely = robot_of_types(topics(path).values()) or UNNAMED_ROBOT
-    notify = warn if set(joints) & set(JOINT_NAMES) else None
+    notify = warn if foreign and set(joints) & set(JOINT_NAMES) else None
     robot = robot_of_file(path, described_robot(recorded_description(path)), asked, likely, notify)
     return RecordedRun(begin, lines, modes, ends, robot, joints, received, foreign)
 

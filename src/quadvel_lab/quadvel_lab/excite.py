@@ -34,7 +34,7 @@ from quadvel_eval.report import read_json
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
 from quadvel_recordings.output import atomic_write, output_recording
 from quadvel_recordings.reading import DESCRIPTION_TOPIC
-from quadvel_sysid.excitation import EXCITATIONS, PERIOD_S, Excitation, limit_torque, propose
+from quadvel_sysid.excitation import EXCITATIONS, PERIOD_S, Excitation, Proposal, limit_torque, propose
 
 RAMP_S = 1.5
 """Time from the initial posture to the start of the motion."""
@@ -231,11 +231,12 @@ def excite_command(
     """
     console = Console(soft_wrap=True)
     if after is not None:
+        proposals = _read_proposals(after)
         if motion is not None:
             raise ValueError(
                 f"found the motion {motion} and --after, which proposes motions: expected one of both"
             )
-        _print_proposals(after, console)
+        _print_proposals(proposals, console)
         return
     if motion not in EXCITATIONS:
         found = "no motion given" if motion is None else f"motion is '{motion}'"
@@ -263,13 +264,17 @@ def excite_command(
         raise typer.Exit(1) from None
 
 
-def _print_proposals(report: Path, console: Console) -> None:
-    """Print the motions that would resolve the ambiguities of a report."""
+def _read_proposals(report: Path) -> Sequence[Proposal]:
+    """Return the motions that would resolve the ambiguities of a report."""
     try:
-        proposals = propose(read_json(report))
+        return propose(read_json(report))
     except (KeyError, TypeError) as error:
         missing = f"the field {error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"{report}: {missing}; expected the report.json of `quadvel identify`") from None
+
+
+def _print_proposals(proposals: Sequence[Proposal], console: Console) -> None:
+    """Print motions, and why they help."""
     if not proposals:
         console.print("The report has no ambiguity that another motion would resolve.")
     for one in proposals:

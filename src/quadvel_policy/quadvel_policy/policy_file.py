@@ -37,7 +37,10 @@ def shipped_policy(robot: Robot) -> Path:
     Raises:
         FileNotFoundError: None is shipped for this robot.
     """
-    remedy = "quadvel up, eval and bench take one of your own with --policy FILE; `quadvel up --policy none` stands"
+    remedy = (
+        "quadvel up, eval and bench take one of your own with --policy FILE; "
+        "`quadvel up --robot ROBOT --policy none --estimator kalman` only stands"
+    )
     return shipped_file(_POLICIES, robot.name, SHIPPED_POLICY.name, "policy", remedy)
 
 

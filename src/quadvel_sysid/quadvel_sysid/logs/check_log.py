@@ -58,8 +58,8 @@ def check_log(log: Log, gains: tuple[float, float] | None = None) -> CheckedLog:
     log = log.with_gains(gains)
     findings = [Finding("note", text.partition(":")[0], (), text) for text in log.remarks]
     if unused:
-        why = "them, so --gains is not used" if len(held) == 2 else "it, so --gains is not used for it"
-        findings.append(Finding("warning", "kp", (), f"{', '.join(held)}: the log holds {why}"))
+        instead = "them, so --gains is not used" if len(held) == 2 else "it, so --gains is not used for it"
+        findings.append(Finding("warning", "kp", (), f"{', '.join(held)}: the log holds {instead}"))
     findings += [Finding("warning", text.partition(":")[0], (), text) for text in log.warnings]
     for check in ROW_CHECKS:
         log = _run_check(check, findings, log)

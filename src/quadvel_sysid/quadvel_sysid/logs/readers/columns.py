@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping, Sequence
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -282,9 +283,9 @@ def _mapped_columns(
             return [of_joints[joint] for joint in ordered], ordered
     for name in columns:
         if name not in raw.arrays:
-            raise LogError(
-                f"{path}: {field}: no '{name}' in it, found {format_names([*raw.arrays, *raw.others], 12)}"
-            )
+            there = [*raw.arrays, *raw.others]
+            near = "".join(f" (did you mean '{one}'?)" for one in get_close_matches(name, there, 1))
+            raise LogError(f"{path}: {field}: no '{name}' in it{near}, found {format_names(there, 12)}")
     return list(columns), None
 
 
