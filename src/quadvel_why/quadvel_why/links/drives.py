@@ -29,9 +29,9 @@ FALLING_SHARE, MAX_T = 0.03, -5.0
 REST_WINDOW_S = 0.5
 REST_RAD_S, MOVING_RAD_S = 0.25, 0.6
 """Speed of a joint at rest, and median speed of all joints of a robot that moves."""
-HEALTHY_REST_SHARES, HEALTHY_RANGE_SHARES = (0.54, 0.32, 0.26), (0.13, 0.43, 0.37)
+HEALTHY_REST_SHARES, HEALTHY_RANGE_SHARES = (0.57, 0.40, 0.46), (0.08, 0.43, 0.37)
 """Largest surplus of the time at rest, and smallest share of the range of motion, of a hip, thigh and calf in healthy
-walks, relative to the median joint of the kind."""
+walks, trotting or pacing (24 of each), relative to the median joint of the kind."""
 WINDOWS_OVERLAP = 10
 """Windows that begin within the length of one."""
 

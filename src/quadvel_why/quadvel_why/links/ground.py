@@ -14,8 +14,10 @@ from ..cause import Cause, Link, Measurement, Trace, worst_span
 from ..legs import HELD_SHARE, WALKED_SLOPE_RAD, Legs
 from ..signals import Signals
 
-LOADED_N = 60.0
-"""A foot that pushes with more cannot be in the act of landing or leaving."""
+LOADED_SHARE = 0.35
+"""Share of the weight. A foot that pushes with more stands: it neither lands, leaves nor swings (a leg that is swung
+fast shows up to 0.3, as its mass is left out).
+"""
 MIN_ROWS = 60
 WINDOW_S = 1.0
 """Time after which a robot that walks from level onto rough ground shows it."""
@@ -27,7 +29,8 @@ MASS_MARGIN_KG = 0.8
 
 
 def _loaded(legs: Legs) -> Array:
-    return np.asarray(legs.planted & (legs.force[..., 2] > LOADED_N))
+    weight = GRAVITY * legs.run.robot.mass
+    return np.asarray(legs.planted & (legs.force[..., 2] > LOADED_SHARE * weight))
 
 
 class Slipping(Cause):
