@@ -81,6 +81,13 @@ def test_more_names_than_joints_are_the_mistake_not_the_column(tmp_path: Path) -
         read_log(tmp_path / "log.npz", names=ColumnMap(joints=("knee", "hip")))
 
 
+def test_times_of_each_joint_are_no_matter_of_names(tmp_path: Path) -> None:
+    given = {name: fields()[name] for name in ("q", "dq", "q_des", "tau", "joint_names")}
+    np.savez(tmp_path / "log.npz", **given, t=np.tile(fields()["t"][:, None], 12))
+    with pytest.raises(LogError, match=r"q: found shape"):
+        read_log(tmp_path / "log.npz")
+
+
 def test_a_scale_may_be_written_as_people_write_it(tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text("t: {from: us, scale: 1e-6}\nq: {from: q, scale: [1E+3, 2]}\n")
     found = ColumnMap.load(tmp_path / "map.yaml").sources

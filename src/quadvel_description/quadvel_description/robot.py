@@ -84,7 +84,7 @@ def robot_of_file(
     path: Path,
     named: str | None,
     asked: str | None,
-    assumed: str = UNNAMED_ROBOT,
+    assumed: str | None = None,
     notify: Callable[[str], None] | None = None,
 ) -> Robot:
     """Load the robot of a recording or another file.
@@ -93,7 +93,7 @@ def robot_of_file(
         path: The file.
         named: Name of the robot in the file, or None.
         asked: Name or file of the robot that was asked for, or None for that of the file.
-        assumed: Name of the robot if the file names none and none was asked for.
+        assumed: Name of the robot if the file names none and none was asked for; None: UNNAMED_ROBOT.
         notify: Called with one sentence if the robot is assumed.
 
     Returns:
@@ -108,7 +108,7 @@ def robot_of_file(
             raise FileNotFoundError(
                 f"{path}: its robot is {named!r}, which is not shipped: name its folder by --robot"
             )
-        robot = load_robot(named or assumed)
+        robot = load_robot(named or assumed or UNNAMED_ROBOT)
         if notify and not named:
             notify(f"robot: the file names none, {robot.title} is assumed: --robot chooses another")
         return robot

@@ -33,7 +33,7 @@ from .odometry import foot_velocity_in_trunk, rolling_velocity
 SWING_SPEED_STD = 10.0  # m/s, standard deviation of the unknown speed of a foot in the air
 SPEED_CORRELATION_S = 1.0  # from the variance of a foot's speed to its random walk
 INITIAL_VARIANCE = 1.0  # (m/s)^2 of the velocity, m^2 of the feet
-_IDENTITY, _ONES = np.eye(3), np.ones(3)
+_IDENTITY = np.eye(3)
 
 
 @attrs.frozen
@@ -117,9 +117,9 @@ class KalmanEstimator:
         self._initial_covariance = np.diag([INITIAL_VARIANCE] * 5 + [self.config.accelerometer**2])
         self._transition = np.eye(5, 6)  # [F | G] of `_predict`
         self._speed_variance = np.zeros((*shape, 4))
-        self._noise = np.full(
-            (*shape, 5), self.config.foot_position**2
-        )  # variances of what `_correct` measures
+        # Variances of what `_correct` measures; 1 / (3 gate^2) of `_foot_speed_variance`, for each axis.
+        self._noise = np.full((*shape, 5), self.config.foot_position**2)
+        self._gate_weights = np.full(3, 1.0 / (3.0 * self.config.slip_gate**2))
         self.reset()
 
     def reset(self, ids: Any = None) -> None:
@@ -247,7 +247,7 @@ class KalmanEstimator:
         """
         expected_variance = covariance[..., :1, 0] + self.config.foot_velocity**2
         difference = leg_velocity[..., :3] - state[..., :1, :]
-        excess = (difference * difference) @ (_ONES / (3.0 * self.config.slip_gate**2)) / expected_variance
+        excess = (difference * difference) @ self._gate_weights / expected_variance
         slip: Array = expected_variance * np.maximum(excess * excess - 1.0, 0.0)
         return slip + swing_variance
 

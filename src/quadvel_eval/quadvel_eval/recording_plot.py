@@ -21,7 +21,7 @@ from matplotlib.patches import Patch
 from quadvel_description.arrays import Array
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot, load_robot, robot_of_file
-from quadvel_description.robot_name import UNNAMED_ROBOT, described_robot
+from quadvel_description.robot_name import described_robot
 from quadvel_recordings.joint_log import JointLog, read_joint_log, robot_of_types
 from quadvel_recordings.output import atomic_write, output_folder
 from quadvel_recordings.reading import RecordingError, read_messages, recorded_description, topics
@@ -160,7 +160,7 @@ def read_recorded_run(
     modes = [(float(loop.clock(received)[k]) - begin, loop.modes[k]) for k in changes]
     ends = max(float(times[-1]) for times, _ in lines.values())
     joints = foreign.state.joints if foreign else JOINT_NAMES
-    likely = robot_of_types(topics(path).values()) or UNNAMED_ROBOT
+    likely = robot_of_types(topics(path).values())
     notify = warn if foreign and set(joints) & set(JOINT_NAMES) else None
     robot = robot_of_file(path, described_robot(recorded_description(path)), asked, likely, notify)
     return RecordedRun(begin, lines, modes, ends, robot, joints, received, foreign)

@@ -9,7 +9,7 @@ import attrs
 
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import robot_of_file
-from quadvel_description.robot_name import UNNAMED_ROBOT, described_robot
+from quadvel_description.robot_name import described_robot
 from quadvel_recordings.joint_log import robot_of_types
 from quadvel_recordings.reading import recorded_description
 from quadvel_recordings.reading import topics as recorded_topics
@@ -48,12 +48,12 @@ def read_log(
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
-    named, likely = None, UNNAMED_ROBOT
+    named = likely = None
     warnings: list[str] = []
     if path.suffix in (".mcap", ".db3", ".bag") or (path.is_dir() and lerobot.find_root(path) != path):
         log = read_recording(path, topics or Topics())
         named = described_robot(recorded_description(path))
-        likely = robot_of_types(recorded_topics(path).values()) or UNNAMED_ROBOT
+        likely = robot_of_types(recorded_topics(path).values())
         if names and (names.sources or names.joints):
             warnings = ["--columns: not used, as this is a recording, whose messages name their fields"]
     else:

@@ -15,8 +15,8 @@ from ..legs import HELD_SHARE, WALKED_SLOPE_RAD, Legs
 from ..signals import Signals
 
 LOADED_SHARE = 0.35
-"""Share of the weight. A foot that pushes with more stands: it neither lands, leaves nor swings (a leg that is swung
-fast shows up to 0.3, as its mass is left out).
+"""Share of the weight. A foot with a larger force stands on the ground: it is not landing, lifting off or swinging. A
+fast swing shows about 0.3, as the mass of the leg is left out.
 """
 MIN_ROWS = 60
 WINDOW_S = 1.0

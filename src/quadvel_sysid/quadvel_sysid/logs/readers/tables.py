@@ -113,7 +113,7 @@ def _log(path: Path, fields: dict[str, Any], names: list[str] | None, remarks: l
     t, q = fields["t"], fields["q"]
     if q.ndim == 1 and (names is None or len(names) == 1):  # of a single joint
         q = q[:, None]
-    if names is not None and q.shape == t.shape:
+    if names is not None and q.ndim == 1 and q.shape == t.shape:
         raise LogError(f"{path}: joint_names: found {len(names)} names, expected 1, as q has one column")
     if t.ndim != 1 or q.ndim != 2 or len(q) != len(t):
         raise LogError(f"{path}: q: found shape {q.shape}, expected ({t.size}, J): a row for each of t")
