@@ -200,6 +200,16 @@ def test_renamed_file_of_a_folder_is_read_with_a_note(tmp_path: Path) -> None:
     assert "walk.mcap" in said[0]
 
 
+def test_folder_of_several_recordings_is_refused_by_their_names(tmp_path: Path) -> None:
+    bag = rosbag2(tmp_path / "bag", own(())) / "bag.mcap"
+    for name in ("run_0.mcap", "run_1.mcap"):
+        (tmp_path / name).write_bytes(bag.read_bytes())
+    read_joint_log(tmp_path, notify=lambda _: None)
+    (tmp_path / "other.mcap").write_bytes(bag.read_bytes())
+    with pytest.raises(RecordingError, match=r"several recordings: other\.mcap, run_0\.mcap"):
+        read_joint_log(tmp_path)
+
+
 def test_first_bytes_of_a_file_count_more_than_its_suffix(tmp_path: Path) -> None:
     path = rosbag2(tmp_path / "bag", own(()))
     (path / "bag.mcap").rename(path / "bag.db3")

@@ -37,6 +37,9 @@ METADATA_KEYS = {
 }
 """Keys without which metadata.yaml is of no use, and how their values begin."""
 
+# A message names at most so many files.
+MAX_NAMES = 5
+
 DESCRIPTION_TOPIC = "/robot_description"
 """Topic of the robot's URDF, by which a recording names its robot."""
 
@@ -155,6 +158,8 @@ def _recording_files(path: Path, notify: Callable[[str], None] | None) -> Sequen
     reason = _metadata_fault(metadata, files) if metadata.exists() else "metadata.yaml is missing"
     if not reason:
         return [path]
+    if len({_file_order(one)[1] for one in files}) > 1:
+        raise RecordingError(f"{path}: the folder has several recordings: {_some_names(files)}; name one of them")
     if files:
         _report(path, f"recording: {reason}; read from {', '.join(one.name for one in files)}", notify)
         return files
@@ -200,10 +205,16 @@ def _storage_suffix(path: Path) -> str:
     return next((suffix for magic, suffix in MAGIC.items() if begin.startswith(magic)), path.suffix)
 
 
+def _some_names(files: Sequence[Path]) -> str:
+    """Return the names of the first files."""
+    names = ", ".join(one.name for one in files[:MAX_NAMES])
+    return names if len(files) <= MAX_NAMES else f"{names} and {len(files) - MAX_NAMES} more"
+
+
 def _file_order(path: Path) -> tuple[int, str]:
-    """Sort key of the files of a split recording: name_0, name_1, ..., name_10."""
+    """Return number and name without it, to sort the files of a split recording: name_0, ..., name_10."""
     number = re.search(r"_(\d+)$", path.stem)
-    return (int(number[1]) if number else -1), path.name
+    return (int(number[1]) if number else -1), path.stem[: number.start()] if number else path.stem
 
 
 def _report(path: Path, text: str, notify: Callable[[str], None] | None) -> None:
