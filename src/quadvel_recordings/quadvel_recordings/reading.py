@@ -159,7 +159,9 @@ def _recording_files(path: Path, notify: Callable[[str], None] | None) -> Sequen
     if not reason:
         return [path]
     if len({_file_order(one)[1] for one in files}) > 1:
-        raise RecordingError(f"{path}: the folder has several recordings: {_some_names(files)}; name one of them")
+        raise RecordingError(
+            f"{path}: the folder has several recordings: {_some_names(files)}; name one of them"
+        )
     if files:
         _report(path, f"recording: {reason}; read from {', '.join(one.name for one in files)}", notify)
         return files
