@@ -6,6 +6,7 @@ causes. All errors are root mean squares of recorded minus replayed joint target
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from weakref import WeakKeyDictionary
 
@@ -40,8 +41,10 @@ REORDERINGS = {
     "FL, FR, RL, RR, grouped by kind of joint": (3, 0, 9, 6, 4, 1, 10, 7, 5, 2, 11, 8),
 }
 """Orders of twelve joints that other stacks use, as indices into ours."""
-MEMORY_S = 1.1
-"""Time from the start of a walk after which the network has forgotten what it held before."""
+EARLY_S = 1.1
+"""Time from the start of a walk in which a memory of earlier shows most, s."""
+LATE_SHARE = 1 / 3
+"""Last share of a walk, in which the network has forgotten what came before it."""
 
 
 @attrs.frozen(eq=False)
@@ -88,13 +91,11 @@ _FOUND: WeakKeyDictionary[PolicyReplay, Explanation] = WeakKeyDictionary()
 def _explain(replay: PolicyReplay) -> Explanation:
     """Try all variants and return the one that leaves the smallest share of the error."""
     base = replay.base
+    if kept := _kept_memory(replay):
+        return kept
     error = base.error
     if not error > AGREES_RAD:
         return Explanation("", "", float(np.nan_to_num(error)), base)
-    later = int(np.searchsorted(base.time, base.time[0] + MEMORY_S))
-    if base.error_from(later) < REPAIRED_SHARE * AGREES_RAD:
-        text = f"after {MEMORY_S} s they agree within {base.error_from(later):.4f} rad"
-        return Explanation("memory_kept", text, error, base)
     factor, left = _action_factor(replay)
     found = [("action_scale", f"with {factor:.2f} times the action scale by {left:.4f} rad", left / error)]
     short = replay.run(Variant("short"), SEARCH_TICKS).error
@@ -109,6 +110,24 @@ def _explain(replay: PolicyReplay) -> Explanation:
     if share > REPAIRED_SHARE:
         return Explanation("other_actions", f"closest is {cause}: {text}", error, base)
     return Explanation(cause, text, error, base)
+
+
+def _kept_memory(replay: PolicyReplay) -> Explanation | None:
+    """Explain actions that differ at first, and agree later where the replay is given the recorded actions.
+
+    A network that starts with another memory may keep another phase of its gait for ever, as its own
+    previous actions maintain it. The recorded ones bring it back, unless something else differs.
+    """
+    base = replay.base
+    early = base.error_within(slice(int(np.searchsorted(base.time, base.time[0] + EARLY_S))))
+    if not early > AGREES_RAD:
+        return None
+    late = slice(-math.ceil(LATE_SHARE * len(base.time)), None)
+    left = replay.run(Variant("the recorded actions", with_recorded_actions=True)).error_within(late)
+    if not left < REPAIRED_SHARE * AGREES_RAD:
+        return None
+    text = f"with the recorded actions as the previous ones they agree within {left:.4f} rad at the end"
+    return Explanation("memory_kept", text, early, base)
 
 
 def _action_factor(replay: PolicyReplay) -> tuple[float, float]:

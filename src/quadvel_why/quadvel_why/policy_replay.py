@@ -69,12 +69,14 @@ class Variant:
         observe: Change of the observation; None: none.
         reset_every: Ticks after which it cleared the memory; 0: never.
         late: Age of the states that it used, ticks; 0: the newest.
+        with_recorded_actions: Whether the previous actions are the recorded ones, not those of the replay.
     """
 
     name: str
     observe: Observe | None = None
     reset_every: int = 0
     late: int = 0
+    with_recorded_actions: bool = False
 
 
 @attrs.frozen(eq=False)
@@ -96,22 +98,22 @@ class Replay:
     @cached_property
     def error(self) -> float:
         """Root mean square of recorded minus expected targets, of all but LEFT_OUT_JOINTS in each tick, rad."""
-        return self.error_from(0)
+        return self.error_within(slice(None))
 
-    def error_from(self, first: int) -> float:
-        """Return the error from a tick on.
+    def error_within(self, part: slice) -> float:
+        """Return the error of some ticks.
 
         Args:
-            first: First tick.
+            part: The ticks.
 
         Returns:
             Root mean square without the LEFT_OUT_JOINTS furthest off in each tick, rad; NaN without
             valid ticks.
         """
-        valid = self.valid[first:]
+        valid = self.valid[part]
         if valid.sum() < MIN_TICKS:
             return float("nan")
-        squares = np.where(valid, (self.recorded[first:] - self.expected[first:]) ** 2, np.nan)
+        squares = np.where(valid, (self.recorded[part] - self.expected[part]) ** 2, np.nan)
         return float(np.sqrt(np.nanmean(np.sort(squares, axis=1)[:, :-LEFT_OUT_JOINTS])))
 
 
@@ -235,7 +237,7 @@ class PolicyReplay:
         rows = np.maximum(run.commands.answers[self.ticks] - late, 0)
         velocity = run.estimate.value[self._velocity_rows]
         command = self._velocity_commands.copy()
-        command[np.hypot(velocity[:, 0], velocity[:, 1]) > MIN_STEPPING_SPEED, 3] = 0.0
+        command[np.linalg.norm(velocity, axis=1) > MIN_STEPPING_SPEED, 3] = 0.0
         return build_observation(
             self.policy.metadata.observation,
             command=command,
@@ -264,17 +266,20 @@ class PolicyReplay:
         term = next(term for term in meta.observation.terms if term.name == "previous_action")
         own = term_slice(meta.observation, term.name)
         bound = np.inf if term.clip is None else term.clip
+        commands, time = self._run.commands, self._run.time[self._run.commands.answers[ticks]]
+        recorded = (commands.target[ticks] - meta.action_offset) / meta.action_scale
         action, actions = np.zeros(JOINTS, np.float32), np.empty((len(ticks), JOINTS), np.float32)
         self.policy.reset()
         for k in range(len(ticks)):
             observation = observations[k].copy()
+            if variant.with_recorded_actions and k:
+                action = recorded[k - 1]
             observation[own] = np.clip((action - term.offset) * term.scale, -bound, bound)
             if variant.observe is not None:
                 observation = variant.observe(observation, meta.observation)
             if variant.reset_every and k % variant.reset_every == 0:
                 self.policy.reset()
             action = actions[k] = self.policy.step(observation)
-        commands, time = self._run.commands, self._run.time[self._run.commands.answers[ticks]]
         faded = time - time[0] >= SupervisorConfig().blend_time
         sound = time < self._fault_time - BEFORE_FAULT_S
         valid = ~self._limited[: len(ticks)] & (faded & sound)[:, None]

@@ -233,19 +233,31 @@ class TorqueModel:
         x, y = _regressors(asked, kp, damping, run.q[keep][:, i]), run.tau[keep][:, i]  # type: ignore[index]
         little = np.abs(self.asked[keep][:, i]) < LITTLE_TORQUE_NM
         use = little if little.sum() >= MIN_ROWS else np.ones(len(y), bool)
-        weights = np.zeros(REGRESSORS)
-        for _ in range(FIT_ROUNDS):
-            weights, *_ = np.linalg.lstsq(x[use], y[use], rcond=None)
-            error = y - x @ weights
-            spread = max(robust_std(error[use]), MIN_SPREAD_NM)
-            use = np.abs(error) < OUTLIER * spread
-            if use.sum() < MIN_ROWS // 2:
-                use = np.ones(len(y), bool)
+        weights, use, spread = _robust_fit(x, y, use)
         covariance = np.linalg.pinv(x[use].T @ x[use]) * np.mean((y - x @ weights)[use] ** 2)
         command, angle, speed, offset = weights.tolist()
         errors = np.sqrt(np.diag(covariance))
         has_moved = bool(run.q[keep][:, i].std() > MIN_MOVED_RAD)
         return DriveFit(command, angle, speed, offset, errors, float(use.mean()), spread, has_moved)
+
+    def slow_offset(self, joint: int) -> float:
+        """Return the offset of a joint's zero in the slower half of the states.
+
+        An offset is there at every speed. What a speed-torque limit takes away, which a fit of all
+        states explains by an offset as well, is not.
+
+        Args:
+            joint: Index of the joint.
+
+        Returns:
+            b / a_1 of the module's equation, rad.
+        """
+        run, speed = self.run, np.abs(self.run.dq[:, joint])
+        keep = self.rows & (speed <= np.median(speed[self.rows]))
+        asked, kp, damping = (each[keep][:, joint] for each in self._products(self.delay))
+        x, y = _regressors(asked, kp, damping, run.q[keep][:, joint]), run.tau[keep][:, joint]  # type: ignore[index]
+        weights, _, _ = _robust_fit(x, y, np.ones(len(y), bool))
+        return float(weights[3] / weights[0])
 
     @cached_property
     def modelled(self) -> Array:
@@ -259,6 +271,28 @@ class TorqueModel:
                 for i, fit in enumerate(self.fits)
             ]
         )
+
+
+def _robust_fit(x: Array, y: Array, use: Bools) -> tuple[Array, Bools, float]:
+    """Least squares without outliers.
+
+    Args:
+        x: Regressors, (n, p).
+        y: Torque, (n,), N m.
+        use: Rows of the first fit, (n,).
+
+    Returns:
+        The weights (p,), the rows that are no outliers, and the standard deviation of their residual.
+    """
+    weights, spread = np.zeros(x.shape[1]), MIN_SPREAD_NM
+    for _ in range(FIT_ROUNDS):
+        weights, *_ = np.linalg.lstsq(x[use], y[use], rcond=None)
+        error = y - x @ weights
+        spread = max(robust_std(error[use]), MIN_SPREAD_NM)
+        use = np.abs(error) < OUTLIER * spread
+        if use.sum() < MIN_ROWS // 2:
+            use = np.ones(len(y), bool)
+    return weights, use, spread
 
 
 def _regressors(asked: Array, kp: Array, damping: Array, q: Array) -> Array:

@@ -31,6 +31,8 @@ CERTAIN = 3.0
 """Standard errors by which a coefficient may differ from its estimate."""
 MIN_SHARE_USED = 0.85
 """Share of the states that a fit has to explain before its coefficients count."""
+SLOW_SHARE = 0.5
+"""Share of an offset that the slower half of the states has to show; the offset itself is there at every speed."""
 HOT_DEG_C = 80.0
 MIN_AGREEING_JOINTS = 9
 
@@ -282,7 +284,8 @@ class JointOffset(Cause):
             if fit.command > CLEAR_COEFFICIENT and is_certain(signals, j):
                 offset = fit.offset / fit.command
                 size = abs(offset) - 3.0 * fit.errors[3] / fit.command
-                if fit.errors[3] / fit.command < 0.02:
+                is_clear = fit.errors[3] / fit.command < 0.02 and size > found[0]
+                if is_clear and signals.torque.slow_offset(j) * np.sign(offset) > SLOW_SHARE * abs(offset):
                     found = max(
                         found, (size, j, f"{offset:+.3f} rad between the drive's angle and the recorded one")
                     )
