@@ -94,7 +94,8 @@ def _explain(replay: PolicyReplay) -> Explanation:
     if kept := _kept_memory(replay):
         return kept
     error = base.error
-    if not error > AGREES_RAD:
+    # A guard that replaces the velocity does so for a while: other policies differ all the time.
+    if not error > AGREES_RAD or base.usual_error < REPAIRED_SHARE * AGREES_RAD:
         return Explanation("", "", float(np.nan_to_num(error)), base)
     factor, left = _action_factor(replay)
     found = [("action_scale", f"with {factor:.2f} times the action scale by {left:.4f} rad", left / error)]

@@ -6,14 +6,14 @@ from ..cause import Cause
 from . import contract, drives, estimator, ground, sensors, task, timing
 
 CAUSES: tuple[type[Cause], ...] = (
+    timing.PolicyRate,
+    contract.MemoryReset,
+    contract.MemoryKept,
     contract.JointOrder,
     contract.JointSign,
     contract.JointScale,
     contract.QuaternionOrder,
     contract.GyroFrame,
-    timing.PolicyRate,
-    contract.MemoryReset,
-    contract.MemoryKept,
     contract.ObservationScale,
     contract.ObservationOrder,
     contract.ActionScale,
@@ -38,8 +38,8 @@ CAUSES: tuple[type[Cause], ...] = (
     drives.WeakDrive,
     drives.JammedJoint,
     ground.SteepGround,
-    ground.Slipping,
     ground.RoughGround,
+    ground.Slipping,
     ground.Payload,
     task.CommandOutOfRange,
 )

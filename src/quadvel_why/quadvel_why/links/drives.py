@@ -26,6 +26,8 @@ PROPORTIONAL, CLEARLY_LESS = 1.5, 0.1
 MIN_SHORT_ROWS = 8
 FALLING_SHARE, MAX_T = 0.03, -5.0
 """Fall of a limit with the speed, by its torque, and t of their correlation; a constant limit has 0.001 and -1."""
+GIVES_MORE = 1.5
+"""A drive whose largest torque is so many times the torque at its limit has no constant limit."""
 REST_WINDOW_S = 0.5
 REST_RAD_S, MOVING_RAD_S = 0.25, 0.6
 """Speed of a joint at rest, and median speed of all joints of a robot that moves."""
@@ -237,7 +239,8 @@ def _shortfall(signals: Signals) -> _Shortfall | None:
         rows,
         float(rows.sum() / model.rows.sum()),
         float(np.median(given)),
-        _falls(given, speed),
+        _falls(given, speed)
+        or bool(np.percentile(np.abs(run.tau[model.rows, j]), 99.0) > GIVES_MORE * np.median(given)),
         bool(np.percentile(speed, 95.0) < REST_RAD_S),
     )
 

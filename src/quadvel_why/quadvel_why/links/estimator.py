@@ -13,8 +13,11 @@ from quadvel_description.arrays import Array, Bools
 from ..cause import NOTHING, Cause, Link, Measurement, Trace, worst_span
 from ..signals import Signals
 
-AGREES_M_S = 0.05
-"""An estimate that differs by less from the shipped estimator on the same states is that estimator's."""
+OTHER_ESTIMATOR_M_S = 0.06
+"""Up to this difference to the shipped estimator, m/s, only the part that bias, scale or lag explain counts.
+
+Another sound estimator differs by so much as well.
+"""
 LAGS_S = np.arange(0.0, 0.51, 0.005)
 MIN_ROWS = 40
 
@@ -24,7 +27,7 @@ class EstimateFit:
     """Deviation of the estimated velocity from a reference, and its best explanation.
 
     Attributes:
-        kind: "", "bias", "scale" or "lag".
+        kind: "bias", "scale" or "lag".
         amount: Bias (m/s), scale (factor) or lag (s), as `kind` states.
         axis: Axis with the largest error.
         error: Root mean square of estimate minus reference, m/s.
@@ -44,6 +47,11 @@ class EstimateFit:
     estimate: Array
     reference: Array
     source: str
+
+    @property
+    def size(self) -> float:
+        """Deviation that counts, m/s."""
+        return self.error if self.error > OTHER_ESTIMATOR_M_S else self.error - self.left
 
 
 @lru_cache(maxsize=4)
@@ -72,9 +80,7 @@ def fit_estimate(signals: Signals) -> EstimateFit | None:
     )
     source = f"the planted feet, which differ by {from_feet:.2f} m/s on the median, and the shipped estimator"
     axis = int(np.argmax((((estimate - replayed)[use])[:, :2] ** 2).mean(axis=0)))
-    kind, amount, left = "", 0.0, error
-    if error > AGREES_M_S:
-        kind, amount, left = _best_kind(run.time, estimate, replayed, use)
+    kind, amount, left = _best_kind(run.time, estimate, replayed, use)
     return EstimateFit(kind, amount, axis, error, left, run.time[use], estimate[use], replayed[use], source)
 
 
@@ -102,7 +108,7 @@ class _Estimate(Cause):
 
     link = Link.ESTIMATOR
     unit = "m/s"
-    least = 0.06
+    least = 0.02
     needs = ("estimate",)
     kind = ""
 
@@ -122,7 +128,7 @@ class _Estimate(Cause):
         )
         sentence = f"{self.describe(found.amount)}; compared with {found.source}: {found.error:.2f} m/s, then {found.left:.2f}"
         off = np.abs(found.estimate - found.reference)[:, axis]
-        return Measurement(found.error, sentence, worst_span(found.time, off), (trace,))
+        return Measurement(found.size, sentence, worst_span(found.time, off), (trace,))
 
     def describe(self, amount: float) -> str:
         """Return the amount in words."""

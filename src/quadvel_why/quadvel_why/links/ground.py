@@ -38,7 +38,7 @@ class Slipping(Cause):
 
     link = Link.GROUND
     unit = "m/s"
-    least = 0.1
+    least = 0.06
     needs = ("ground", "estimate")
     remedy = "Walk slower on this ground, with softer feet, or train with less friction"
 
