@@ -9,12 +9,13 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
-from quadvel_estimator import features
 from quadvel_estimator.tracker import MAX_STALE_STATES, VelocityTracker
 from quadvel_nodes.messages import MessageError
 from tests.helpers.robots import ALIENGO
 
 State = Callable[..., RobotState]
+MOVING = np.ones(12)
+"""Speeds of the joints of a robot that is not at rest, rad/s."""
 
 
 class Scripted:
@@ -128,7 +129,7 @@ def test_the_position_is_what_the_velocity_adds_up_to(
     for i in range(steps + 1):
         half = 0.5 * (np.pi / 2) * i / steps
         estimate = tracker.process(
-            standing(0.005 * i, quaternion=np.array([np.cos(half), 0.0, 0.0, np.sin(half)]))
+            standing(0.005 * i, dq=MOVING, quaternion=np.array([np.cos(half), 0.0, 0.0, np.sin(half)]))
         )
     assert estimate is not None
     radius = 0.005 * steps / (np.pi / 2)
@@ -138,12 +139,47 @@ def test_the_position_is_what_the_velocity_adds_up_to(
 
 def test_a_restart_leaves_the_position_where_it_was(tracker: VelocityTracker, standing: State) -> None:
     for i in range(201):
-        before = tracker.process(standing(0.005 * i))
-    after = tracker.process(standing(10.0))
+        before = tracker.process(standing(0.005 * i, dq=MOVING))
+    after = tracker.process(standing(10.0, dq=MOVING))
     assert before is not None
     assert after is not None
     np.testing.assert_allclose(before.position, [1.0, 0.0, 0.0])
     np.testing.assert_array_equal(after.position, before.position)
+
+
+def test_the_position_of_a_robot_at_rest_stays_whatever_the_estimate_is(
+    tracker: VelocityTracker, standing: State
+) -> None:
+    rng = np.random.default_rng(0)
+    found = [
+        tracker.process(standing(0.005 * i, dq=MOVING if i < 100 else 0.1 * rng.standard_normal(12)))
+        for i in range(400)
+    ]
+    estimates = [one for one in found if one is not None]
+    assert [one.stays for one in estimates[:100]] == [False] * 100
+    assert all(one.stays for one in estimates[300:])
+    np.testing.assert_array_equal(estimates[-1].position, estimates[300].position)
+    np.testing.assert_array_equal(estimates[-1].position_deviation, estimates[300].position_deviation)
+    assert estimates[-1].velocity.tolist() == [1.0, 0.0, 0.0]
+
+
+def test_the_position_of_a_robot_with_damped_joints_stays(tracker: VelocityTracker, standing: State) -> None:
+    for time, mode in ((0.0, MODE_SERVO), (0.005, MODE_DAMPING), (0.01, MODE_DAMPING), (0.015, MODE_SERVO)):
+        tracker.set_command(ALIENGO, ALIENGO.nominal_q, mode)
+        estimate = tracker.process(standing(time, dq=MOVING))
+        assert estimate is not None
+        assert estimate.stays == (mode == MODE_DAMPING)
+    np.testing.assert_allclose(estimate.position, [0.005, 0.0, 0.0])
+
+
+def test_a_trunk_that_turns_or_one_joint_that_moves_is_no_rest(
+    tracker: VelocityTracker, standing: State
+) -> None:
+    turning, one_joint = np.array([0.0, 0.0, 0.1]), 0.1 * np.eye(12)[4]
+    for change in ({"angular_velocity": turning}, {"dq": one_joint}):
+        found = [tracker.process(standing(0.005 * i, **change)) for i in range(200)]
+        assert not any(one.stays for one in found if one is not None)
+        tracker = VelocityTracker(Scripted())
 
 
 def test_odometry_starts_at_zero_where_the_robot_was_put_to_another_place(
@@ -162,8 +198,8 @@ def test_the_estimator_sees_the_targets_in_force(
     tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
     tracker.process(standing(0.0))
-    tracker.set_previous_action(features.previous_action(ALIENGO, ALIENGO.nominal_q + 0.1, MODE_SERVO))
+    tracker.set_command(ALIENGO, ALIENGO.nominal_q + 0.1, MODE_SERVO)
     tracker.process(standing(0.005))
-    tracker.set_previous_action(features.previous_action(ALIENGO, ALIENGO.nominal_q + 0.1, MODE_DAMPING))
+    tracker.set_command(ALIENGO, ALIENGO.nominal_q + 0.1, MODE_DAMPING)
     tracker.process(standing(0.010))
     np.testing.assert_allclose(estimator.actions, np.array([np.zeros(12), np.full(12, 0.1), np.zeros(12)]))

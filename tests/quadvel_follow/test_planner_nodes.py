@@ -20,6 +20,7 @@ from std_msgs.msg import String
 from quadvel_follow.follow_planner_node import FollowPlannerNode
 from quadvel_follow.trajectory_planner import TrajectoryPlanner
 from quadvel_msgs.msg import ControllerState
+from quadvel_nodes.node import _exit_requests
 
 RECEIVED = {
     "cmd_vel_follow": Twist,
@@ -176,3 +177,17 @@ def test_a_way_begins_once_the_robot_walks(begin: Callable[..., Peer]) -> None:
     assert set(peer.speeds("cmd_vel")[heard + 5 :]) == {0.0}
     refusal = ""
     peer.wait(lambda: max(peer.speeds("cmd_vel")) > 0.1, send)
+
+
+def test_a_way_ends_with_the_reason_where_the_robot_stops_following(
+    begin: Callable[..., Peer], capfd: pytest.CaptureFixture[str]
+) -> None:
+    peer = begin(TrajectoryPlanner, "-p", "file:=eight")
+    controller = peer.node.create_publisher(ControllerState, "controller/state", 1)
+    state = ControllerState(findings=["the command is clamped"])
+    peer.wait(lambda: max(peer.speeds("cmd_vel"), default=0.0) > 0.1, lambda: controller.publish(state))
+    state.walk_refusal = "the robot is in mode fault"
+    peer.wait(lambda: peer.tested in _exit_requests, lambda: controller.publish(state))
+    assert "the robot is in mode fault" in _exit_requests[peer.tested]
+    assert "controller: the command is clamped" in "".join(capfd.readouterr())
+    peer.wait(lambda: peer.speeds("cmd_vel")[-1] == 0.0)

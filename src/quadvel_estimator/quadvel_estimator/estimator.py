@@ -38,7 +38,6 @@ from quadvel_nodes.scheduling import Scheduling
 from quadvel_nodes.silence import SilenceWarning
 from quadvel_nodes.stall_free_clock import StallFreeClock
 
-from . import features
 from .kalman import KalmanEstimator
 from .learned import LearnedEstimator
 from .tracker import Estimate, Estimator, VelocityTracker
@@ -128,7 +127,7 @@ class EstimatorNode(Node):
     def _on_command(self, data: bytes) -> None:
         try:
             command = decode_low_cmd(data)
-            self._tracker.set_previous_action(features.previous_action(self._robot, command.q, command.mode))
+            self._tracker.set_command(self._robot, command.q, command.mode)
         except MessageError as error:
             self._refusals.add("low_cmd", error)
 
@@ -173,7 +172,7 @@ class EstimatorNode(Node):
         fill_vector(message.pose.pose.position, position)
         fill_quaternion(message.pose.pose.orientation, state.quaternion)
         message.pose.covariance = _covariance(np.diag(variances), ORIENTATION_VARIANCE)
-        fill_vector(message.twist.twist.linear, estimate.velocity)
+        fill_vector(message.twist.twist.linear, np.zeros(3) if estimate.stays else estimate.velocity)
         fill_vector(message.twist.twist.angular, state.angular_velocity)
         message.twist.covariance = _covariance(estimate.covariance, GYRO_VARIANCE)
         self._odom.publish(message)

@@ -22,7 +22,6 @@ from quadvel_actuator import ActuatorParameters
 from quadvel_description.arrays import Array
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot
-from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_estimator.tracker import Estimator, VelocityTracker
@@ -116,7 +115,7 @@ def run_estimator(
     topics = ("/low_state", "/low_cmd")
     for topic, receipt, message in read_messages(path, lambda topic, _: topic in topics, lambda _: None):
         if topic == "/low_cmd":
-            tracker.set_previous_action(previous_action(robot, np.asarray(message.q, float), message.mode))
+            tracker.set_command(robot, np.asarray(message.q, float), message.mode)
             continue
         try:
             state = read_low_state(message)

@@ -54,7 +54,8 @@ class TrajectoryPlanner(Node):
     """ROS node that executes a trajectory.
 
     It starts once somebody listens to its velocities, the robot would follow them, and, in closed loop,
-    odometry arrives. Until then it commands zero and says what it waits for.
+    odometry arrives. Until then it commands zero and says what it waits for. It ends with exit code 1
+    where the robot does not follow its velocities any more.
     """
 
     def __init__(self) -> None:
@@ -68,6 +69,7 @@ class TrajectoryPlanner(Node):
         self._odom_received_at = -np.inf  # s
         self._started_at: float | None = None
         self._refusal = self._said = ""  # why the robot would not walk; what was said last
+        self._findings: set[str] = set()  # findings of the controller that were logged
         self._since: float | None = None  # s, when the node began to wait
         self._refusals = Refusals()
         self._publisher = self.create_publisher(Twist, "cmd_vel", 10)
@@ -87,6 +89,10 @@ class TrajectoryPlanner(Node):
 
     def _on_robot(self, message: Any) -> None:
         self._refusal = message.walk_refusal
+        if self._started_at is not None:
+            for finding in set(message.findings) - self._findings:
+                self.get_logger().warning(f"controller: {finding}")
+            self._findings.update(message.findings)
 
     def _missing(self, now: float) -> str:
         """What the start waits for; "" if nothing is missing."""
@@ -109,13 +115,16 @@ class TrajectoryPlanner(Node):
                 return
             self._started_at = now
             self.get_logger().info("starts")
+        if self._refusal:
+            self._give_up(f"the robot does not walk any more: {self._refusal}")
+            return
         if self._is_blind(now):
-            request_exit(self, f"trajectory_planner: odom is silent for more than {ODOM_TIMEOUT_S} s")
+            self._give_up(f"odom is silent for more than {ODOM_TIMEOUT_S} s")
             return
         try:
             velocity = self._follower.step(now - self._started_at, self._pose)
         except ValueError as error:
-            request_exit(self, f"trajectory_planner: {error}")
+            self._give_up(str(error))
             return
         twist = Twist()
         if velocity is None:  # the trajectory has ended: zero
@@ -124,6 +133,11 @@ class TrajectoryPlanner(Node):
         else:
             twist.linear.x, twist.linear.y, twist.angular.z = velocity.tolist()
         self._publisher.publish(twist)
+
+    def _give_up(self, reason: str) -> None:
+        """Command zero and end with exit code 1."""
+        self._publisher.publish(Twist())
+        request_exit(self, f"trajectory_planner: {reason}")
 
     def _say(self, sentence: str, now: float) -> None:
         """Log what the node waits for, once, if it still does after SILENCE_S."""

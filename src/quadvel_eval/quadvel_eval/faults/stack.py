@@ -17,7 +17,6 @@ import numpy as np
 from quadvel_description.arrays import Array
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_driver.link import MAX_COMMAND_AGE_MS, clamp_for_board
-from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_estimator.tracker import VelocityTracker
@@ -239,9 +238,7 @@ class Stack:
     def _command_to_estimator(self, message: Message) -> None:
         """Estimator: take the joint command, its previous action."""
         self.processes["estimator"].submit(
-            lambda: self._tracker.set_previous_action(
-                previous_action(self.simulator.config.robot, message.q, message.mode)
-            )
+            lambda: self._tracker.set_command(self.simulator.config.robot, message.q, message.mode)
         )
 
     def _state_to_controller(self, message: Message) -> None:
