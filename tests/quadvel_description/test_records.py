@@ -51,7 +51,7 @@ def test_nested_mappings_become_records() -> None:
         ),
         ({"open": "no"}, "open: found 'no', expected true or false"),
         ({"name": 3}, "name: found 3, expected a text"),
-        ({"centre": [1, 2, 3]}, "Cart.centre: found shape (3,), expected one number or 2"),
+        ({"centre": [1, 2, 3]}, "Cart.centre: found shape (3,), expected one number or a list of 2"),
     ],
 )
 def test_wrong_content_is_refused_with_its_place(content: object, expected: str) -> None:

@@ -142,7 +142,7 @@ def test_the_plants_physics_knows_nothing_of_what_identification_fits() -> None:
         ("kind: dry_gear\nslip: {FR_knee: 1.0}\nstick: {}", "slip: joint names: found 'FR_knee'"),
         (
             "kind: dry_gear\nslip: much\nstick: {}",
-            "slip: found 'much', expected one number or 12",
+            "slip: found 'much', expected one number or a list of 12",
         ),
         ("kind: dry_gear\nslip: {}", "stick: found nothing, expected a value"),
         (

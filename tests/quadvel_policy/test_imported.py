@@ -327,7 +327,7 @@ def changed(content: Any, place: str, value: object) -> Any:
         ("stiffness", [1.0, 2.0], "stiffness: found [1.0, 2.0], expected a finite number or 12 of them"),
         ("damping", "soft", "damping: found 'soft'"),
         ("motors", 12, "motors: found 12, expected only joint_ids_map"),
-        ("default_joint_pos", [0.0] * 12, "default posture, joint 2"),
+        ("default_joint_pos", [0.0] * 12, "default_joint_pos[5], FR_calf_joint"),
         ("commands.base_velocity.ranges.lin_vel_y", None, "ranges.lin_vel_y: found nothing"),
         ("actions.JointVelocityAction", {}, "actions.JointVelocityAction: found {}"),
         ("actions.JointPositionAction.offset", None, "JointPositionAction.offset: found nothing"),
@@ -444,6 +444,7 @@ def test_a_network_that_does_not_fit_its_file_is_refused(
 
 
 def test_torchscript_is_refused_unopened(tmp_path: Path) -> None:
+    (tmp_path / "policy.pt").touch()
     with pytest.raises(NetworkFileError, match=r"policy\.pt: is TorchScript, .* expected ONNX"):
         import_policy(GO2, tmp_path / "policy.pt", None, tmp_path / "out.onnx")
 

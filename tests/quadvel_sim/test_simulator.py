@@ -503,7 +503,10 @@ def test_another_seed_gives_another_run_and_its_number_brings_it_back() -> None:
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
-        ({"friction": [0.5, 0.5]}, r"SimulatorConfig.friction: found shape \(2,\), expected one number or 4"),
+        (
+            {"friction": [0.5, 0.5]},
+            r"SimulatorConfig.friction: found shape \(2,\), expected one number or a list of 4",
+        ),
         ({"friction": -0.1}, "SimulatorConfig.friction: found .*, expected finite numbers, at least 0"),
         ({"watchdog": 0.0}, "SimulatorConfig.watchdog: found 0.0, expected at least 0.001"),
         ({"payload": float("nan")}, "SimulatorConfig.payload: found nan, expected -8 to 50"),

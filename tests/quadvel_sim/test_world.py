@@ -407,3 +407,15 @@ def test_a_file_that_is_none_is_refused(tmp_path: Path) -> None:
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ValueError, match=r"binary.yaml: no text"):
         World.load(tmp_path / "binary.yaml")
+
+
+@pytest.mark.parametrize(
+    ("parts", "name"),
+    [
+        ({"boxes": (Box(position=np.zeros(2), size=np.array([0.5, 0.5, 1.0])),)}, "box_0"),
+        ({"walls": (Wall(points=np.array([[-1.0, 0.0], [1.0, 0.0]])),)}, "wall_0"),
+    ],
+)
+def test_an_obstacle_where_the_robot_starts_is_refused_by_name(parts: dict[str, Any], name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name}.* where the robot starts"):
+        Simulator(SimulatorConfig(robot=ALIENGO, world=World(**parts)))

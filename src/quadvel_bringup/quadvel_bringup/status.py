@@ -179,7 +179,9 @@ def _lines(heard: Heard) -> Iterator[tuple[str, str]]:
     else:
         yield "mode", "[red]no controller is running"
     if estimates:
-        yield "estimate", velocity_text(twist_to_array(estimates[-1].twist.twist))
+        fell = bool(states) and states[-1].mode_name == "fault"
+        note = "; wrong while the robot falls or lies" if fell else ""
+        yield "estimate", velocity_text(twist_to_array(estimates[-1].twist.twist)) + note
     if heard["odom"]:
         position = heard["odom"][-1].pose.pose.position
         x, y = (number_text(value, ".2f") for value in (position.x, position.y))

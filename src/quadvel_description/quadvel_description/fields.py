@@ -161,9 +161,9 @@ def _check_choice(
 def _check_size(size: int, record: object, attribute: attrs.Attribute[Any], value: Any) -> None:
     """Refuse anything but an array of the right length."""
     if not isinstance(value, np.ndarray):
-        raise refusal(record, attribute.name, value, f"one number or {size}")
+        raise refusal(record, attribute.name, value, f"one number or a list of {size}")
     if value.shape != (size,):
         found = f"shape {value.shape}"
         raise ValueError(
-            f"{type(record).__name__}.{attribute.name}: found {found}, expected one number or {size}"
+            f"{type(record).__name__}.{attribute.name}: found {found}, expected one number or a list of {size}"
         )

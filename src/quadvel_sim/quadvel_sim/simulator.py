@@ -72,6 +72,8 @@ class Truth:
 
 MAX_PUSH_WEIGHTS = 10.0
 """Largest force of all pushes together, in weights of the robot; some 50 make the physics diverge."""
+MAX_START_DEPTH_M = 0.01
+"""Depth to which a robot may start inside an obstacle, m."""
 MAX_PUSH_ARM_M = 0.2
 """Largest torque of all pushes together, in weights of the robot times 1 m; 0.5 m make it diverge."""
 
@@ -135,6 +137,20 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
     return model
 
 
+def _check_start(model: mujoco.MjModel, ground: Bools) -> None:
+    """Refuse an obstacle inside which the lying robot would start; `ground`: whether each geom is ground."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("lie").id)
+    mujoco.mj_fwdPosition(model, data)
+    moves = model.body_weldid[model.geom_bodyid] != 0
+    for contact in data.contact:
+        robot, other = sorted(contact.geom, key=lambda geom: not moves[geom])
+        if contact.dist < -MAX_START_DEPTH_M and moves[robot] and not moves[other] and not ground[other]:
+            raise ValueError(
+                f"world: {model.geom(other).name} stands where the robot starts, expected room around the origin"
+            )
+
+
 class Simulator:
     """Simulated robot on its ground with a step of 1 ms.
 
@@ -178,6 +194,8 @@ class Simulator:
         limits = self.model.jnt_range, self.model.jnt_solref, self.model.jnt_solimp
         self._joint_limits = [(field, field.copy()) for field in limits]
         self.reset()
+        if world is not None:
+            _check_start(self.model, self._ground)
 
     def reset(self, keyframe: str = "lie", seed: int | None = None) -> None:
         """Put the robot at the origin, at rest, with time zero and braking drives.
@@ -338,13 +356,14 @@ class Simulator:
         wrenches = np.array([wrench, *(push.wrench for push in self._pushes)]).reshape(-1, 2, 3)
         force, torque = np.linalg.norm(wrenches, axis=2).sum(axis=0)
         weight = float(self.model.body_subtreemass[1] * np.linalg.norm(self.model.opt.gravity))
-        for name, total, limit, unit in (
-            ("force", force, MAX_PUSH_WEIGHTS * weight, "N"),
-            ("torque", torque, MAX_PUSH_ARM_M * weight, "N m"),
+        for name, total, unit, share, by in (
+            ("force", force, "N", MAX_PUSH_WEIGHTS, "times the robot's weight"),
+            ("torque", torque, "N m", MAX_PUSH_ARM_M, "m times the robot's weight"),
         ):
+            limit = share * weight
             if total > limit:
                 found = f"found {total:.4g} {unit} of all pushes together"
-                raise ValueError(f"push: {name}: {found}, expected at most {limit:.4g}")
+                raise ValueError(f"push: {name}: {found}, expected at most {limit:.4g}, {share:g} {by}")
 
     def fail_joint(self, name: str) -> None:
         """Switch off a drive until the next reset: its torque, also the measured one, is zero.

@@ -13,6 +13,7 @@ import attrs
 from quadvel_description.bounded_yaml import read_yaml
 from quadvel_description.network_file import NetworkFileError, metadata_texts, read_network
 from quadvel_description.onnx_format import Message, message, serialise
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot
 
 from ..observation import Bounds
@@ -60,7 +61,7 @@ def import_policy(
             the value found and the value expected.
     """
     fields = None if config is None else _read_known(config)
-    if weights.suffix in PICKLED:
+    if weights.suffix in PICKLED and weights.exists():
         raise NetworkFileError(
             f"{weights}: is TorchScript, which can run code when it is opened, expected ONNX: convert it "
             "where you trust it, with torch.onnx.export(torch.jit.load(file), torch.zeros(1, n), 'policy.onnx')"
@@ -71,7 +72,8 @@ def import_policy(
         metadata = _read_mjlab(robot, weights, model, output, supplement)
     else:
         metadata = _read_config(robot, config, fields, output, supplement)
-    _check_posture(robot, config or weights, metadata)
+    reader = mjlab if config is None else unitree_rl_lab if unitree_rl_lab.is_deploy_yaml(fields) else rl_sar
+    _check_posture(robot, f"{config or weights}: {reader.POSTURE_FIELD}", metadata)
     entry = message("StringStringEntryProto", key=IMPORTED_KEY, value=metadata.to_json())
     model = attrs.evolve(model, fields=model.fields | {"metadata_props": [entry]})
     ImportedPolicy(robot, weights, model)  # refuses a network that does not fit
@@ -138,12 +140,11 @@ def _action_output(weights: Path, model: Message) -> str:
     return str(names[0])
 
 
-def _check_posture(robot: Robot, path: Path, metadata: ImportedMetadata) -> None:
-    """Refuse a default posture that the drives do not accept."""
+def _check_posture(robot: Robot, field: str, metadata: ImportedMetadata) -> None:
+    """Refuse a default posture that the drives do not accept; `field`: its file and field."""
     for i, (low, q, high) in enumerate(
         zip(robot.command_lower, metadata.nominal_q, robot.command_upper, strict=True)
     ):
         if not low <= q <= high:
-            raise FormatError(
-                f"{path}: default posture, joint {i} (order FR, FL, RR, RL): found {q}, expected {low} to {high} rad"
-            )
+            place = f"{field}[{metadata.joint_map.index(i)}], {JOINT_NAMES[i]}"
+            raise FormatError(f"{place}: found {q}, expected {low} to {high} rad")

@@ -22,6 +22,8 @@ TERMS = {
     "actions": "previous_action",
 }
 """Our quantity by name of the term."""
+POSTURE_FIELD = "default_joint_pos"
+"""The default posture, rad, in the order of the network."""
 NUMBER_FIELDS = ("joint_stiffness", "joint_damping", "default_joint_pos", "action_scale")
 NAME_FIELDS = ("joint_names", "command_names", "observation_names")
 UNUSED_FIELDS = ("run_path",)
@@ -71,7 +73,7 @@ def read(
     joint_map = tuple(JOINT_NAMES.index(name) for name in names)
     if len(file.texts("command_names")) != 1:
         file.refuse("command_names", "one command, a velocity")
-    nominal = file.numbers("default_joint_pos", JOINTS)
+    nominal = file.numbers(POSTURE_FIELD, JOINTS)
     return ImportedMetadata(
         robot=robot,
         source="mjlab metadata",
@@ -82,8 +84,8 @@ def read(
         action_scale=to_our_order(file.numbers("action_scale", JOINTS), joint_map),
         target_low=(-UNBOUNDED,) * JOINTS,
         target_high=(UNBOUNDED,) * JOINTS,
-        kp=to_our_order(file.numbers("joint_stiffness", JOINTS), joint_map),
-        kd=to_our_order(file.numbers("joint_damping", JOINTS), joint_map),
+        kp=to_our_order(file.gains("joint_stiffness", "kp"), joint_map),
+        kd=to_our_order(file.gains("joint_damping", "kd"), joint_map),
         rate_hz=rate_hz,
         command_limits=limits,
         output=output,

@@ -26,6 +26,8 @@ TERMS = {
     "actions": ("previous_action", ""),
 }
 """Our quantity and the field of its scale ("": 1) by name of the term."""
+POSTURE_FIELD = "default_dof_pos"
+"""The default posture, rad, in the order of the network."""
 USED_FIELDS = (
     "dt", "decimation", "num_of_dofs", "wheel_indices", "joint_names", "joint_mapping", "default_dof_pos",
     "rl_kp", "rl_kd", "action_scale", "clip_obs", "clip_actions_lower", "clip_actions_upper",
@@ -77,7 +79,7 @@ def read(path: Path, fields: Any, robot: str, output: str, limits: dict[str, Bou
     if period <= 0.0 or not np.isclose(period * RATE_HZ, max(round(period * RATE_HZ), 1)):
         file.refuse("decimation", f"dt * decimation to be a multiple of {1.0 / RATE_HZ:g} s")
     lower, upper = (file.numbers(f"clip_actions_{end}", JOINTS) for end in ("lower", "upper"))
-    nominal, scale = file.numbers("default_dof_pos", JOINTS), file.numbers("action_scale", JOINTS)
+    nominal, scale = file.numbers(POSTURE_FIELD, JOINTS), file.numbers("action_scale", JOINTS)
     targets = np.sort(np.array(nominal) + np.array([lower, upper]) * scale, axis=0)
     ages = _ages(file)
     terms = tuple(_term(file, name, nominal, (lower, upper), ages) for name in file.texts("observations"))
@@ -95,8 +97,8 @@ def read(path: Path, fields: Any, robot: str, output: str, limits: dict[str, Bou
         action_scale=to_our_order(scale, joint_map),
         target_low=to_our_order(tuple(targets[0].tolist()), joint_map),
         target_high=to_our_order(tuple(targets[1].tolist()), joint_map),
-        kp=to_our_order(file.numbers("rl_kp", JOINTS), joint_map),
-        kd=to_our_order(file.numbers("rl_kd", JOINTS), joint_map),
+        kp=to_our_order(file.gains("rl_kp", "kp"), joint_map),
+        kd=to_our_order(file.gains("rl_kd", "kd"), joint_map),
         rate_hz=1.0 / period,
         command_limits=limits,
         output=output,

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from ..observation import JOINTS, Vector
+from ..observation import JOINTS, MAX_GAINS, Vector
 
 
 class FormatError(ValueError):
@@ -122,6 +122,21 @@ class Section:
             self.refuse(name, "a finite number" if size == 1 else f"a finite number or {size} of them")
         return tuple(np.broadcast_to(numbers, size).tolist())
 
+    def gains(self, name: str, kind: str) -> Vector:
+        """Read the gains of the joints.
+
+        Args:
+            name: The field.
+            kind: "kp" or "kd".
+
+        Returns:
+            The gains, (12,).
+        """
+        gains, most = self.numbers(name, JOINTS), MAX_GAINS[kind]
+        if not 0.0 <= min(gains) <= max(gains) <= most:
+            self.refuse(name, f"gains from 0 to {most:g}")
+        return gains
+
     def bounds(self, name: str, size: int) -> tuple[Vector, Vector] | None:
         """Read pairs (low, high).
 
@@ -137,7 +152,8 @@ class Section:
             return None
         pairs = _finite(value)
         if pairs.shape not in ((2,), (size, 2)) or not (pairs[..., 0] < pairs[..., 1]).all():
-            self.refuse(name, f"a pair (low, high) or {size} of them")
+            many = f", or {size} of them" if size > 1 else ""
+            self.refuse(name, f"a pair [low, high] with low below high{many}")
         low, high = np.broadcast_to(pairs, (size, 2)).T
         return tuple(low.tolist()), tuple(high.tolist())
 

@@ -27,6 +27,8 @@ TERMS = {
 """Our quantity by name of the term."""
 ORDER_FIELDS = ("use_gym_history", "scale_first")
 """Fields among the terms: history by step instead of by term; scale before clip instead of after."""
+POSTURE_FIELD = "default_joint_pos"
+"""The default posture, rad, in the order of the network."""
 AXES = {"vx": "lin_vel_x", "vy": "lin_vel_y", "wz": "ang_vel_z"}
 
 
@@ -69,7 +71,7 @@ def read(path: Path, fields: Any, robot: str, output: str) -> ImportedMetadata:
     period = file.number("step_dt")
     if period <= 0.0 or not np.isclose(period * RATE_HZ, max(round(period * RATE_HZ), 1)):
         file.refuse("step_dt", f"a multiple of {1.0 / RATE_HZ:g} s")
-    nominal = file.numbers("default_joint_pos", JOINTS)
+    nominal = file.numbers(POSTURE_FIELD, JOINTS)
     actions = file.section("actions")
     actions.allow_only(["JointPositionAction"])
     action = actions.section("JointPositionAction")
@@ -91,8 +93,8 @@ def read(path: Path, fields: Any, robot: str, output: str) -> ImportedMetadata:
         action_scale=to_our_order(action.numbers("scale", JOINTS), joint_map),
         target_low=to_our_order(low, joint_map),
         target_high=to_our_order(high, joint_map),
-        kp=file.numbers("stiffness", JOINTS),
-        kd=file.numbers("damping", JOINTS),
+        kp=file.gains("stiffness", "kp"),
+        kd=file.gains("damping", "kd"),
         rate_hz=1.0 / period,
         command_limits=_command_limits(file),
         output=output,

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import attrs
 import numpy as np
 
-from quadvel_description.arrays import Floats, Indices
+from quadvel_description.arrays import Bools, Floats, Indices
 from quadvel_description.quadruped import JOINT_NAMES
 
 from ..findings import Finding, format_names
@@ -82,6 +82,22 @@ def slope_at_rows(log: Log, values: Floats, row: Indices) -> Floats:
     return np.asarray((values[last] - values[first]) / (log.t[last] - log.t[first])[:, None], dtype=float)
 
 
+def resting(log: Log) -> Bools:
+    """Return which joints never move, but for the noise of their encoders.
+
+    Args:
+        log: The log.
+
+    Returns:
+        (J,).
+    """
+    span, spread = np.ptp(log.q, axis=0), np.std(log.q, axis=0)
+    # White noise of variance s^2 has second differences of variance 6 s^2.
+    noise = np.std(np.diff(log.q, n=2, axis=0), axis=0) / np.sqrt(6.0)
+    rests = (spread < RESTING_RAD) & (spread < RESTING_RATIO * noise)
+    return np.asarray((span < MOVING_SPAN_RAD) | rests)
+
+
 def motionless(log: Log) -> Iterator[Finding]:
     """Joints that never move, but for the noise of their encoders.
 
@@ -91,13 +107,10 @@ def motionless(log: Log) -> Iterator[Finding]:
     Yields:
         A refusal if no joint moves, a warning if some joints do not.
     """
-    span, spread = np.ptp(log.q, axis=0), np.std(log.q, axis=0)
-    # White noise of variance s^2 has second differences of variance 6 s^2.
-    noise = np.std(np.diff(log.q, n=2, axis=0), axis=0) / np.sqrt(6.0)
-    rests = (spread < RESTING_RAD) & (spread < RESTING_RATIO * noise)
-    still = log.joints_where((span < MOVING_SPAN_RAD) | rests)
+    still = log.joints_where(resting(log))
     if len(still) == len(log.joints):
-        text = f"q: no joint moves by more than {1e3 * spread.max():.1f} mrad (rms), so nothing can be identified"
+        largest = 1e3 * np.std(log.q, axis=0).max()
+        text = f"q: no joint moves by more than {largest:.1f} mrad (rms), so nothing can be identified"
         yield Finding("refusal", "q", still, f"{text}: record a motion, as `quadvel excite` does")
     elif still:
         text = f"q: never moves: {format_names(still)}; only their torque at rest is observed"

@@ -18,7 +18,7 @@ from quadvel_description.arrays import Bools, Floats, Indices
 
 from ..findings import Finding, format_names
 from ..log import Log
-from .channels import DEGREE_RAD, MOVING_SPAN_RAD, TURN_RAD
+from .channels import DEGREE_RAD, MOVING_SPAN_RAD, TURN_RAD, resting
 
 MAX_ROWS = 4000
 """Rows of a log that are used, spread over its length."""
@@ -333,7 +333,7 @@ def unresponsive(log: Log, found: Response) -> Iterator[Finding]:
     """
     used = log.valid[found.rows].any(axis=0)
     lost = found.answered_share < MIN_ANSWERED_SHARE
-    moves = np.ptp(log.q[found.rows], axis=0) > MOVING_SPAN_RAD
+    moves = ~resting(log)
     if (lost | ~used).all():
         rests = np.ptp(log.q_des, axis=0) < MOVING_SPAN_RAD
         never = (
@@ -367,7 +367,9 @@ def gain_units(log: Log, found: Response) -> Iterator[Finding | Log]:
     if log.kp is None:
         return
     asked = np.median(log.kp[log.command_rows(log.t[found.rows])], axis=0)
-    clear = (found.min_error_share < EXPLAINED_ERROR_SHARE) & (asked > 0.0) & (found.gain > 0.0)
+    clear = (
+        ~resting(log) & (found.min_error_share < EXPLAINED_ERROR_SHARE) & (asked > 0.0) & (found.gain > 0.0)
+    )
     if not clear.any():
         return
     ratio = found.gain / np.where(asked > 0.0, asked, 1.0)

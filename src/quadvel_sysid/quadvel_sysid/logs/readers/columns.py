@@ -38,6 +38,9 @@ from .names import ALL_JOINTS, FIELDS, JOINT_NAMES_FIELD, resolve_columns
 from .raw import RawArrays
 from .units import si_factor
 
+UNUSED = "columns that no field is read from: "
+"""Begin of the remark that lists them."""
+
 
 def _check_keys(mapping: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
     """Raise LogError for a key that is not known."""
@@ -251,7 +254,7 @@ def _add_unmapped(
         if name and name != JOINT_NAMES_FIELD and not _is_used(name, used)
     ]
     if others:
-        remarks.append(f"{others[0]}: not used, as no log has such fields: {format_names(others)}")
+        remarks.append(f"{UNUSED}{format_names(others)}")
     return joints
 
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from quadvel_description.arrays import Floats
 
+from ..findings import format_names
 from ..log import LogError
 from . import units
 from .names import TIME_FIELDS
@@ -219,8 +220,10 @@ def _chosen(path: Path, columns: Sequence[str], choose: ColumnChooser) -> Mappin
     """The columns that are needed, each with its field, in the order of the table."""
     chosen = choose(columns)
     if not chosen:
-        there = ", ".join(columns)[:60]
-        raise LogError(f"{path}: t: no such column in the head ({there}); {EXPECTED_HEAD}")
+        there = format_names(columns, 12)
+        raise LogError(
+            f"{path}: t: no such column in the head ({there}); {EXPECTED_HEAD}, or --columns MAPFILE for other names"
+        )
     for column, times in Counter(columns).items():
         if times > 1 and column in chosen:
             raise LogError(f"{path}: {column}: the column stands there twice")

@@ -15,13 +15,18 @@ from quadvel_description.arrays import Bools, Floats
 from quadvel_description.quadruped import JOINT_NAMES
 
 from ..log import Log, LogError, joint_name
-from .columns import ColumnMap, count_whole_rows, read_fields
+from .columns import UNUSED, ColumnMap, count_whole_rows, read_fields
 from .raw import check_size
 
 STATE_FIELDS = ("q", "dq", "tau", "temperature")
 """Fields on the times of the states."""
 COMMAND_FIELDS = ("dq_des", "tau_ff", "kp", "kd")
 """Fields on the times of the commands, besides q_des."""
+
+EXPECTED_COMMANDS = (
+    "; expected q_des, or t_cmd and q_des_cmd, which may be in a file of their own "
+    "(a log of torque commands alone says nothing about a position drive)"
+)
 
 
 def read_table(path: Path, names: ColumnMap) -> Log:
@@ -40,14 +45,15 @@ def read_table(path: Path, names: ColumnMap) -> Log:
     fields, joints, remarks = read_fields(path, names)
     check_size(path, {name: np.shape(values) for name, values in fields.items()})
     pickled = next((one for one in remarks if "a pickle" in one), "")
-    for name in ("t", "q", "q_des") if pickled and "q_des_cmd" not in fields else ("t", "q"):
-        if name not in fields:
-            there = ", ".join(fields) or "none"
-            if pickled:
-                raise LogError(f"{path}: {name}: the field is missing, found {there}; {pickled}")
-            more = next((one for one in remarks if "not used" in one), "").partition("such fields: ")[2]
-            more = f"; of {more}, --columns MAPFILE says which is what" if more else ""
-            raise LogError(f"{path}: {name}: the field is missing, found {there}{more}")
+    needed = ("t", "q") if "q_des_cmd" in fields else ("t", "q", "q_des")
+    missing = next((name for name in needed if name not in fields), "")
+    if missing:
+        unused = next((one.removeprefix(UNUSED) for one in remarks if one.startswith(UNUSED)), "")
+        more = f"; of {unused}, --columns MAPFILE says which is what" if unused else ""
+        raise LogError(
+            f"{path}: {missing}: the field is missing, found {', '.join(fields) or 'none'}"
+            f"{f'; {pickled}' if pickled else more}{EXPECTED_COMMANDS if missing == 'q_des' else ''}"
+        )
     remarks = [one for one in remarks if one != pickled]
     return _log(path, _cut_incomplete_rows(path, fields, remarks), joints, remarks)
 
@@ -184,10 +190,6 @@ def _commands(path: Path, fields: dict[str, Any], t: Floats, joints: int) -> tup
     own = "q_des_cmd" in fields
     if own and "t_cmd" not in fields:
         raise LogError(f"{path}: t_cmd: the field is missing, expected the times of q_des_cmd")
-    if not own and "q_des" not in fields:
-        text = "expected q_des, or t_cmd and q_des_cmd; --columns MAPFILE reads other names, and files of their own"
-        torque = "(a log of torque commands alone says nothing about a position drive)"
-        raise LogError(f"{path}: q_des: the field is missing, {text} {torque}")
     t_cmd = fields["t_cmd"] if own else t
     name = "q_des_cmd" if own else "q_des"
     q_des = _per_joint(fields[name], len(t_cmd), joints) if joints == 1 else fields[name]
