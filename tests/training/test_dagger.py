@@ -9,14 +9,13 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
-from quadvel_policy.observation import VelocityCommandLimits, default_observation  # noqa: E402
+from quadvel_policy.observation import VelocityCommandLimits  # noqa: E402
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import dagger, loop, privileged, teacher  # noqa: E402
 from quadvel_training.__main__ import app  # noqa: E402
 from quadvel_training.dagger import DaggerConfig, DaggerRun  # noqa: E402
 from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun  # noqa: E402
 from quadvel_training.random_walks import RandomCommands  # noqa: E402
-from quadvel_why.policy_replay import term_slice  # noqa: E402
 from tests.helpers.robots import ALIENGO  # noqa: E402
 
 SMALL = DaggerConfig(n=8, threads=1, length=6, mini_batches=2, learning_rate=3e-3)
@@ -207,15 +206,6 @@ def test_robots_that_have_not_lifted_a_foot_count_as_standing(run):
     run._start_over(np.array([5]))
     *_, standing, _ = run.collect()
     assert (standing[:, 5] == 1.0).all()
-
-
-def test_the_student_steps_until_it_is_slow_as_under_the_supervisor(run):
-    run.env.command[:] = 0.0, 0.0, 0.0, 1.0
-    run.env.velocity[:4], run.env.velocity[4:] = (0.15, 0.0, 0.0), (0.25, 0.0, 0.0)
-    place = term_slice(default_observation(ALIENGO), "command")
-    stands = dagger.observe(run.env, np.zeros((8, 12), np.float32))[:, place.stop - 1]
-    assert stands.tolist() == [1.0] * 4 + [0.0] * 4
-    assert (run.env.command[:, 3] == 1.0).all()
 
 
 def test_labels_are_smoothed(run, monkeypatch):

@@ -92,6 +92,15 @@ def test_led_commands_go_the_way_that_the_command_mux_leads_them():
         assert env.command[2].tolist() == goal
 
 
+def test_a_robot_that_has_to_stand_steps_until_it_is_slow_as_under_the_supervisor():
+    env = VelocityEnv(attrs.evolve(QUIET, n=8, ramped=0.0))
+    env._goal[:], env._ramp[:] = [0.0, 0.0, 0.0, 1.0], np.inf
+    env.velocity[:4], env.velocity[4:] = [0.15, 0.0, 0.0], [0.25, 0.0, 0.0]
+    env._ramp_commands(slice(None))
+    assert env.command[:, 3].tolist() == [1.0] * 4 + [0.0] * 4
+    assert not env.command[:, :3].any()
+
+
 def test_a_share_of_the_commands_is_led_and_the_others_come_at_once():
     env = VelocityEnv(attrs.evolve(QUIET, n=400, ramped=0.3, commands=CommandRange(stance=0.0)))
     assert np.mean((env.command == env._goal).all(axis=1)) == pytest.approx(0.7, abs=0.1)

@@ -42,7 +42,6 @@ from quadvel_policy.observation import (
     build_observation,
     default_observation,
 )
-from quadvel_policy.supervisor import MIN_STEPPING_SPEED
 from quadvel_sim.terrain import Terrain
 
 from . import process_group
@@ -432,9 +431,6 @@ def action_map(env: VelocityEnv) -> ActionMap:
 def observe(env: VelocityEnv, previous: np.ndarray) -> np.ndarray:
     """Noisy observations of the student.
 
-    As from the supervisor, a robot that is to stand first gets zero velocity as its command, until
-    it is slow enough to stop stepping.
-
     Args:
         env: environments.
         previous: (n, 12), action of the tick before.
@@ -442,10 +438,8 @@ def observe(env: VelocityEnv, previous: np.ndarray) -> np.ndarray:
     Returns:
         (n, 48).
     """
-    command = env.command.copy()
-    command[np.linalg.norm(env.velocity, axis=1) > MIN_STEPPING_SPEED, 3] = 0.0
     return build_observation(
-        default_observation(env.robot), command=command, previous_action=previous, **env.sense()
+        default_observation(env.robot), command=env.command, previous_action=previous, **env.sense()
     )
 
 

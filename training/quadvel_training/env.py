@@ -23,6 +23,7 @@ from quadvel_description.kinematics import foot_kinematics, foot_positions, roll
 from quadvel_description.quadruped import GRAVITY
 from quadvel_description.robot import Robot
 from quadvel_policy.observation import VelocityCommandLimits
+from quadvel_policy.supervisor import MIN_STEPPING_SPEED
 from quadvel_sim.physics import Physics
 from quadvel_sim.terrain import Terrain
 
@@ -285,7 +286,7 @@ class VelocityEnv:
         self.stand_q = robot.nominal_q + mjcf.gravity_torque(self.model) / c.kp
 
         n = c.n
-        self.command = np.zeros((n, 4))
+        self.command, self.velocity = np.zeros((n, 4)), np.zeros((n, 3))
         self._goal, self._ramp = np.zeros((n, 4)), np.full(n, np.inf)
         self.changed = np.zeros(n, bool)
         self.broken = np.zeros(n, bool)
@@ -372,7 +373,8 @@ class VelocityEnv:
     def _ramp_commands(self, ids: np.ndarray | slice) -> None:
         """Move commands a sample closer to what was drawn.
 
-        The stance flag follows once the velocity is 0.
+        The stance flag follows once the commanded velocity is 0 and the robot so slow that the
+        supervisor lets it stop stepping.
         """
         goal, command = self._goal[ids, :3], self.command[ids, :3]
         way = goal - command
@@ -381,7 +383,8 @@ class VelocityEnv:
         step = self._ramp[ids, None] * RAMP_AXES * np.where(slower, RAMP_DOWN, 1.0) * self.config.period
         command = command + way / np.maximum(np.abs(way) / step, 1.0).max(axis=1, keepdims=True)
         self.command[ids, :3] = command
-        self.command[ids, 3] = self._goal[ids, 3] * (command == 0.0).all(axis=1)
+        is_slow = np.linalg.norm(self.velocity[ids], axis=1) <= MIN_STEPPING_SPEED
+        self.command[ids, 3] = self._goal[ids, 3] * (command == 0.0).all(axis=1) * is_slow
 
     def tick(
         self,

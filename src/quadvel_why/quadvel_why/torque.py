@@ -284,9 +284,10 @@ def _robust_fit(x: Array, y: Array, use: Bools) -> tuple[Array, Bools, float]:
     Returns:
         The weights (p,), the rows that are no outliers, and the standard deviation of their residual.
     """
-    weights, spread = np.zeros(x.shape[1]), MIN_SPREAD_NM
+    weights: Array = np.zeros(x.shape[1])
+    spread = MIN_SPREAD_NM
     for _ in range(FIT_ROUNDS):
-        weights, *_ = np.linalg.lstsq(x[use], y[use], rcond=None)
+        weights = np.asarray(np.linalg.lstsq(x[use], y[use], rcond=None)[0], np.float64)
         error = y - x @ weights
         spread = max(robust_std(error[use]), MIN_SPREAD_NM)
         use = np.abs(error) < OUTLIER * spread
