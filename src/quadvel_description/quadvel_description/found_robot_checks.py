@@ -86,7 +86,11 @@ def _feet_and_imu(found: FoundRobot) -> Iterator[Finding]:
     """Report missing feet and a missing IMU."""
     missing = [leg for leg, foot in zip(LEGS, found.feet, strict=True) if np.isnan(foot).any()]
     if missing:
-        yield Finding("feet", f"no sphere on the calf of {', '.join(missing)}: add one for each foot", True)
+        yield Finding(
+            "feet",
+            f"no collision sphere on the calf, or on the link fixed to it, of {', '.join(missing)}: add one for each foot",
+            True,
+        )
     elif np.ptp(found.foot_radii) > MAX_LENGTH_DIFFERENCE:
         yield Finding("feet", f"radii {found.foot_radii.tolist()} m differ, expected one radius", True)
     if found.imu is None:
