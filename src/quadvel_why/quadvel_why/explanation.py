@@ -18,10 +18,10 @@ from quadvel_description.network_input import InputLayout
 
 from .policy_replay import Observe, PolicyReplay, Replay, Variant, term_slice
 
-AGREES_RAD = 0.02
-"""Largest error of targets that count as the policy's own.
+AGREES_RAD, CLOSE_RAD = 0.012, 0.006
+"""Largest error of targets that count as the policy's own, and of those that certainly are.
 
-An observation with the velocity of a neighbouring tick causes a quarter of this.
+An observation with the velocity of a neighbouring tick causes 0.005.
 """
 REPAIRED_SHARE = 0.35
 """Share of the error of the unchanged policy that an accepted variant may leave."""
@@ -95,7 +95,7 @@ def _explain(replay: PolicyReplay) -> Explanation:
         return kept
     error = base.error
     # A guard that replaces the velocity does so for a while: other policies differ all the time.
-    if not error > AGREES_RAD or base.usual_error < REPAIRED_SHARE * AGREES_RAD:
+    if not error > AGREES_RAD or base.usual_error < CLOSE_RAD:
         return Explanation("", "", float(np.nan_to_num(error)), base)
     factor, left = _action_factor(replay)
     found = [("action_scale", f"with {factor:.2f} times the action scale by {left:.4f} rad", left / error)]
@@ -125,7 +125,7 @@ def _kept_memory(replay: PolicyReplay) -> Explanation | None:
         return None
     late = slice(-math.ceil(LATE_SHARE * len(base.time)), None)
     left = replay.run(Variant("the recorded actions", with_recorded_actions=True)).error_within(late)
-    if not left < REPAIRED_SHARE * AGREES_RAD:
+    if not left < CLOSE_RAD:
         return None
     text = f"with the recorded actions as the previous ones they agree within {left:.4f} rad at the end"
     return Explanation("memory_kept", text, early, base)

@@ -210,4 +210,6 @@ class Legs:
         total = np.concatenate([[0.0], np.cumsum(moment)])
         change, mean = rate[2 * half :] - rate[: -2 * half], (total[2 * half : -1] - total[: -2 * half - 1])
         use = self.usable[2 * half :] & self.usable[: -2 * half]
-        return float(np.corrcoef(change[use], mean[use])[0, 1]) if use.sum() > MIN_BALANCE_ROWS else 0.0
+        if use.sum() <= MIN_BALANCE_ROWS or np.ptp(change[use]) == 0.0 or np.ptp(mean[use]) == 0.0:
+            return 0.0
+        return float(np.corrcoef(change[use], mean[use])[0, 1])

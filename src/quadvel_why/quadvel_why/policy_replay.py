@@ -116,8 +116,10 @@ class Replay:
 
     @property
     def usual_error(self) -> float:
-        """Error that three of four ticks do not exceed, as `error`, rad."""
-        ticks = self._squares[self.valid.any(axis=1)]
+        """Error that three of four ticks do not exceed, as `error`, rad; NaN without valid ticks."""
+        if self.valid.sum() < MIN_TICKS:
+            return float("nan")
+        ticks = self._squares[np.isfinite(self._squares).any(axis=1)]
         return float(np.sqrt(np.percentile(np.nanmean(ticks, axis=1), 75.0)))
 
     @cached_property

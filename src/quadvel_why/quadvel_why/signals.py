@@ -163,7 +163,9 @@ class Signals:
                 ratio = float(x[use] @ y[use] / (x[use] @ x[use]))
                 off = np.abs(y - ratio * x)
                 use = use & (off <= 4.0 * 1.4826 * np.median(off[use]) + 1e-9)
-            found[j] = ratio if np.corrcoef(x[use], y[use])[0, 1] ** 2 > 0.6 else np.nan
+            with np.errstate(invalid="ignore"):  # an encoder that is held shows one speed: no correlation
+                correlation = float(np.corrcoef(x[use], y[use])[0, 1])
+            found[j] = ratio if correlation**2 > 0.6 else np.nan
         return found
 
     @cached_property

@@ -11,7 +11,7 @@ from typing_extensions import override
 from quadvel_description.arrays import Array
 
 from ..cause import NOTHING, Cause, Link, Measurement, Trace, worst_span
-from ..explanation import Explanation
+from ..explanation import AGREES_RAD, Explanation
 from ..hypotheses import CONVENTIONS, best_convention, best_offset
 from ..imu import USUAL_GYROSCOPE, USUAL_QUATERNION
 from ..signals import Signals
@@ -457,7 +457,7 @@ class _Actions(Cause):
 
     link = Link.CONTRACT
     unit = "rad"
-    least = 0.02
+    least = AGREES_RAD
     needs = ("policy",)
 
     @override
