@@ -13,7 +13,7 @@ from .gait_clock import GaitClock
 STRIDE_S = 0.35  # time constant of stride errors: about a stride
 LASTING_S = 1.5  # time constant of lasting errors
 MAX_LAG = 0.2  # m, m, rad: a robot that does not follow is not to make up for more later
-CATCH_UP_TURN = 2.0  # 1/s: this times the angle that a robot lags behind is added to its teacher's yaw rate
+CATCH_UP_TURN = 1.0  # 1/s: this times the angle that a robot lags behind is added to its teacher's yaw rate
 TRANSIENT_S = 1.0  # after the plan has reached a command, not part of lasting errors and scores
 STEADY_S = 0.5  # time constant with which a velocity that the plan has reached counts as steady,
 STEADY_END_S = 0.1  # and with which it ceases to under a new command
