@@ -86,7 +86,7 @@ NODES = [
     Step("python -m quadvel_training --help"),
     Step("quadvel run sim_node --ros-args -p terrain:=rough", served=True),
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r low_cmd:=/test/low_cmd", served=True),
-    Step("quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel", served=True),
+    Step("quadvel run command_mux --ros-args -r cmd_vel:=/joy/cmd_vel", served=True),
     Step("quadvel run driver --ros-args -p dry_run:=true", served=True),
     Step("quadvel run person_tracker --ros-args -p laser_x:=0.25", served=True),
     Step("quadvel run follow_planner --ros-args -p laser_x:=0.25 -p side:=left", served=True),

@@ -465,7 +465,7 @@ def test_a_limit_that_no_robot_reaches_is_refused(field: str, value: float) -> N
     ("field", "value"), [("max_torque_step", 89.0), ("max_torque_error", 45.0), ("max_power", 1e4)]
 )
 def test_a_limit_beyond_the_drives_of_the_robot_is_refused(policy: Any, field: str, value: float) -> None:
-    expected = rf"^\w+\.{field}: found {value}, expected at most [0-9.]+, what the drives of AlienGo can do$"
+    expected = rf"^{field}: found {value}, expected at most [0-9.]+, what the drives of AlienGo can do$"
     with pytest.raises(ValueError, match=expected):
         Supervisor(ALIENGO, policy, make_record(SupervisorConfig, {field: value}))
 

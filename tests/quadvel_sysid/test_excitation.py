@@ -69,7 +69,16 @@ def test_target_requests_at_most_its_share_of_the_torque_limit() -> None:
 def report(*names: str, depends_on: tuple[str, ...] = ()) -> dict[str, Any]:
     effects = [{"name": names[0], "indistinguishable": list(names[1:])}] if names else []
     verdict = "structured" if depends_on else "white"
-    return {"effects": effects, "unexplained": {"verdict": verdict, "depends_on": list(depends_on)}}
+    unexplained = {"verdict": verdict, "depends_on": list(depends_on)}
+    return {"joints": ["FR_hip_joint"], "effects": effects, "unexplained": unexplained}
+
+
+def test_a_proposal_names_the_robot_and_moves_no_robot_for_a_bench() -> None:
+    content = report("thermal_drift", "supply_sag")
+    assert "--robot" not in propose(content)[0].command
+    assert propose(content | {"robot": "go2"})[0].command.endswith(" --robot go2")
+    assert propose(content, "out/third")[0].command.endswith(" --robot out/third")
+    assert not propose(content | {"joints": ["elbow"]})[0].command.startswith("quadvel")
 
 
 def test_distinguished_effect_needs_no_further_excitation() -> None:

@@ -39,7 +39,7 @@ Nodes:
 \b
 Further arguments are those of ROS 2:
   quadvel run sim_node --ros-args -p terrain:=rough
-  quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel
+  quadvel run command_mux --ros-args -r cmd_vel:=/joy/cmd_vel
 """
 
 

@@ -245,7 +245,8 @@ class RecurrentNetwork:
         text = self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
         if text is None:
             raise NetworkFileError(
-                f"{self.path}: has no metadata under the key {METADATA_KEY!r}, expected a JSON object"
+                f"{self.path}: has no metadata under the key {METADATA_KEY!r}, expected a JSON object "
+                "(`quadvel policy import` adds it to a policy of another project)"
             )
         try:
             metadata = json.loads(text)

@@ -20,7 +20,8 @@ from . import bench
 from .compare import comparison_table, read_evaluation
 from .faults.campaign import run_campaign
 from .faults.report import campaign_summary, campaign_table, write_campaign
-from .grid import evaluate
+from .grid import evaluate, grid_cells
+from .paper.cells import is_within_limits
 from .report import evaluation_table, write_evaluation, write_json
 from .walk import Setup
 
@@ -83,19 +84,24 @@ def eval_command(
         actuator=actuator,
         **named,
     )
-    load_policy(chosen, setup.policy)  # fail on a bad file here, once, before any run
+    limits = load_policy(chosen, setup.policy).metadata.limits  # fails on a bad file here, before any run
     if setup.estimator_file is not None:
         LearnedEstimator(chosen, setup.estimator_file)
     if actuator is not None:
         ActuatorParameters.load(chosen, actuator)
-    folder = output_folder(out)
+    folder, console = output_folder(out), Console()
+    commands = [cell.command for cell in grid_cells(grid, 1)]
+    if beyond := sum(not is_within_limits(command, limits) for command in commands):
+        console.print(
+            f"{beyond} of {len(commands)} commands exceed the policy's limits, which cut them: "
+            "their error counts what was cut"
+        )
     with walk_progress_bar() as bar:
         task = bar.add_task("walks", total=None)
         result = evaluate(
             setup, grid, seeds, lambda done, of: bar.update(task, completed=done, total=of), cluster
         )
     write_evaluation(folder, {**result, "setup": {**setup.to_json(), "grid": grid, "seeds": seeds}})
-    console = Console()
     console.print(evaluation_table(result))
     console.print(f"written: {folder}/eval.json, eval.csv, eval.png")
 

@@ -231,7 +231,7 @@ def excite_command(
     """
     console = Console(soft_wrap=True)
     if after is not None:
-        proposals = _read_proposals(after)
+        proposals = _read_proposals(after, "" if robot == DEFAULT_ROBOT else robot)
         if motion is not None:
             raise ValueError(
                 f"found the motion {motion} and --after, which proposes motions: expected one of both"
@@ -264,10 +264,10 @@ def excite_command(
         raise typer.Exit(1) from None
 
 
-def _read_proposals(report: Path) -> Sequence[Proposal]:
-    """Return the motions that would resolve the ambiguities of a report."""
+def _read_proposals(report: Path, robot: str) -> Sequence[Proposal]:
+    """Return the motions that would resolve the ambiguities of a report; `robot`: "" for the report's."""
     try:
-        return propose(read_json(report))
+        return propose(read_json(report), robot)
     except (KeyError, TypeError) as error:
         missing = f"the field {error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"{report}: {missing}; expected the report.json of `quadvel identify`") from None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import attrs
 
-from quadvel_description.fields import field, positive, refusal
+from quadvel_description.fields import field, positive
 from quadvel_description.robot import Robot
 
 from .command_limits import JointCommandLimits
@@ -58,16 +58,18 @@ class SupervisorConfig:
             robot: The robot.
 
         Raises:
-            ValueError: A limit is larger, so that it would limit nothing.
+            ValueError: Limits are larger, so that they would limit nothing; names them all.
         """
         torque = float(robot.torque_limit.max())
         power = float(robot.torque_limit @ robot.velocity_limit)  # of all drives at their limits
-        for record, name, most in (
-            (self.joint_limits, "max_torque_step", 2.0 * torque),  # from one torque limit to the other
-            (self.joint_limits, "max_power", power),
-            (self.guards, "max_torque_error", torque),
-        ):
-            if (found := getattr(record, name)) > most:
-                raise refusal(
-                    record, name, found, f"at most {most:g}, what the drives of {robot.title} can do"
-                )
+        too_large = [
+            f"{name}: found {getattr(record, name)}, expected at most {most:g}"
+            for record, name, most in (
+                (self.joint_limits, "max_torque_step", 2.0 * torque),  # from one torque limit to the other
+                (self.joint_limits, "max_power", power),
+                (self.guards, "max_torque_error", torque),
+            )
+            if getattr(record, name) > most
+        ]
+        if too_large:
+            raise ValueError(f"{'; '.join(too_large)}, what the drives of {robot.title} can do")

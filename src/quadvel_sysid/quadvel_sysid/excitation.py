@@ -19,8 +19,9 @@ from typing_extensions import override
 from quadvel_description.arrays import Array
 from quadvel_description.command_range import clip_to_command_range
 from quadvel_description.kinematics import foot_jacobians, inverse_kinematics
-from quadvel_description.quadruped import GRAVITY
+from quadvel_description.quadruped import GRAVITY, JOINT_NAMES
 from quadvel_description.robot import Robot
+from quadvel_description.robot_name import DEFAULT_ROBOT, shipped_robots
 
 PERIOD_S = 0.001
 """s between two targets."""
@@ -360,17 +361,22 @@ class Proposal:
         separates: Names of the effects, or descriptions of the residual, that it would
             distinguish.
         reason: Why this excitation distinguishes them.
+        robot: Name or folder of the robot; "" for joints on a bench, which `quadvel excite` does not move.
     """
 
     excitation: str
     seconds: float
     separates: tuple[str, ...]
     reason: str
+    robot: str
 
     @property
     def command(self) -> str:
         """The command that records it, as it is typed."""
-        return f"quadvel excite {self.excitation} --seconds {self.seconds:g}"
+        if not self.robot:
+            return f"move the joints for {self.seconds:g} s as `quadvel excite {self.excitation}` moves a robot's"
+        chosen = "" if self.robot == DEFAULT_ROBOT else f" --robot {self.robot}"
+        return f"quadvel excite {self.excitation} --seconds {self.seconds:g}{chosen}"
 
 
 _REASONS = {
@@ -415,26 +421,32 @@ _EXCITATION_OF_SIGNAL = {
 """Excitation that varies a signal most."""
 
 
-def propose(report: Mapping[str, Any]) -> list[Proposal]:
+def propose(report: Mapping[str, Any], robot: str = "") -> list[Proposal]:
     """Propose excitations that would settle what a report leaves open.
 
     Args:
         report: Content of report.json.
+        robot: Name or folder of the robot; "" for the one of the report.
 
     Returns:
         One proposal for each excitation; empty if all effects are distinguished and the residual
         is white.
     """
     found: list[Proposal] = []
+    if not robot and set(report["joints"]) & set(JOINT_NAMES):
+        robot = report.get("robot", DEFAULT_ROBOT)
+        robot = robot if robot in shipped_robots() else f"<folder of {robot}>"
     for effect in report["effects"]:
         names = (effect["name"], *effect["indistinguishable"])
         if len(names) > 1:
             kinds = dict.fromkeys(_BEST_EXCITATION.get(name, "steps") for name in names)
-            found += [_make_proposal(kind, names) for kind in kinds]
+            found += [_make_proposal(kind, names, robot) for kind in kinds]
     unexplained = report["unexplained"]
     if unexplained["verdict"] == "structured":
         for signal in unexplained["depends_on"]:
-            found.append(_make_proposal(_excitation_for_signal(signal), (f"what depends on {signal}",)))
+            found.append(
+                _make_proposal(_excitation_for_signal(signal), (f"what depends on {signal}",), robot)
+            )
     return _merge_by_excitation(found)
 
 
@@ -445,11 +457,11 @@ def _excitation_for_signal(signal: str) -> str:
     return "chirp" if "@" in signal else _EXCITATION_OF_SIGNAL.get(signal, "steps")
 
 
-def _make_proposal(kind: str, separates: tuple[str, ...]) -> Proposal:
+def _make_proposal(kind: str, separates: tuple[str, ...], robot: str) -> Proposal:
     """A proposal with the usual duration, or a longer one for slow effects."""
     usual: float = attrs.fields_dict(EXCITATIONS[kind])["seconds"].default  # type: ignore[assignment]
     slow = [_MIN_DURATION_S[name] for name in separates if kind == "sweep" and name in _MIN_DURATION_S]
-    return Proposal(kind, max([usual, *slow]), separates, _REASONS[kind])
+    return Proposal(kind, max([usual, *slow]), separates, _REASONS[kind], robot)
 
 
 def _merge_by_excitation(proposals: list[Proposal]) -> list[Proposal]:

@@ -30,7 +30,7 @@ from quadvel_description.robot import is_robot, load_robot
 from quadvel_description.robot_name import shipped_robots
 
 from ..data.log_signals import as_double
-from ..logs.log import Log, LogError
+from ..logs.log import Log, LogError, joint_name
 
 _WARM_UP_S = 0.04
 """s of measured motion before a stretch, which fill the model's delays and memories."""
@@ -69,13 +69,12 @@ class Legs:
             FileNotFoundError: There is no such description.
         """
         model = _load_robot(robot)
-        known = {model.joint(k).name for k in range(model.njnt)}
+        known = {joint_name(model.joint(k).name): model.joint(k).name for k in range(model.njnt)}
         for name in joints:
             if name not in known:
-                raise ValueError(
-                    f"--robot {robot}: joint '{name}' of the log is missing, found {', '.join(sorted(known))}"
-                )
-        return cls(model, tuple(joints))
+                there = ", ".join(sorted(known.values()))
+                raise ValueError(f"--robot {robot}: joint '{name}' of the log is missing, found {there}")
+        return cls(model, tuple(known[name] for name in joints))
 
     def inertia(self, q: Array) -> Array:
         """Compute the inertia matrix of the joints, with the trunk held still.

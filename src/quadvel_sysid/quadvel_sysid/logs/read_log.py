@@ -61,10 +61,16 @@ def read_log(
         if topics and (topics.state or topics.command):
             warnings = ["--state-topic, --command-topic: not used, as this is a table, which has no topics"]
     remarks = list(log.remarks)
-    notify = remarks.append if set(log.joints) & set(JOINT_NAMES) else None
+    on_bench = not set(log.joints) & set(JOINT_NAMES)
+    notify = None if on_bench else remarks.append
     try:
         found = robot_of_file(path, named, robot, likely, notify)
     except ValueError as error:
         raise LogError(str(error)) from None
+    if on_bench and robot is None:
+        remarks.append(
+            f"robot: none, as the joints are not a quadruped's; the model has the torque limits of {found.title}, "
+            "--base FILE states others"
+        )
     log = attrs.evolve(log, robot=found, remarks=tuple(remarks), warnings=(*log.warnings, *warnings))
     return log if joints is None else log.select_joints(joints)

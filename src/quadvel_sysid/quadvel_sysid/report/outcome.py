@@ -202,6 +202,7 @@ def _report(o: Outcome) -> dict[str, Any]:
     floor = min(noise, mses["after"]["train_mse"] or noise)
     report = {
         "schema": SCHEMA,
+        "robot": o.base.robot,
         "joints": list(samples.joints),
         "units": UNITS,
         "noise_floor": floor,
