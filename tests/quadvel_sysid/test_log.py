@@ -233,7 +233,7 @@ def test_one_column_is_not_used_for_every_joint(tmp_path: Path) -> None:
 
 def test_unused_fields_are_reported(tmp_path: Path) -> None:
     log = read_log(npz(tmp_path / "a.npz", Tau=np.zeros(3), t_cmd=fields()["t"]))
-    assert "columns that no field is read from: Tau" in log.remarks
+    assert "Tau: not used, as no field is read from columns of this name" in log.remarks
     assert "t_cmd: not used, as q_des_cmd is not there; q_des is taken at the times t" in log.remarks
 
 

@@ -38,8 +38,8 @@ from .names import ALL_JOINTS, FIELDS, JOINT_NAMES_FIELD, resolve_columns
 from .raw import RawArrays
 from .units import si_factor
 
-UNUSED = "columns that no field is read from: "
-"""Begin of the remark that lists them."""
+UNUSED = ": not used, as no field is read from columns of this name"
+"""End of the remark that lists such columns."""
 
 
 def _check_keys(mapping: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
@@ -254,7 +254,7 @@ def _add_unmapped(
         if name and name != JOINT_NAMES_FIELD and not _is_used(name, used)
     ]
     if others:
-        remarks.append(f"{UNUSED}{format_names(others)}")
+        remarks.append(f"{format_names(others)}{UNUSED}")
     return joints
 
 

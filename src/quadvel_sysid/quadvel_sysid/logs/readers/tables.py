@@ -48,7 +48,7 @@ def read_table(path: Path, names: ColumnMap) -> Log:
     needed = ("t", "q") if "q_des_cmd" in fields else ("t", "q", "q_des")
     missing = next((name for name in needed if name not in fields), "")
     if missing:
-        unused = next((one.removeprefix(UNUSED) for one in remarks if one.startswith(UNUSED)), "")
+        unused = next((one.removesuffix(UNUSED) for one in remarks if one.endswith(UNUSED)), "")
         more = f"; of {unused}, --columns MAPFILE says which is what" if unused else ""
         raise LogError(
             f"{path}: {missing}: the field is missing, found {', '.join(fields) or 'none'}"
