@@ -135,6 +135,7 @@ def test_no_recording_is_written_over(tmp_path: Path) -> None:
 
 def test_after_a_report_it_says_what_to_record_next(tmp_path: Path) -> None:
     report = {
+        "joints": ["FR_hip_joint"],
         "effects": [{"name": "coulomb_friction", "indistinguishable": ["stribeck_friction"]}],
         "unexplained": {"verdict": "white", "depends_on": []},
     }
