@@ -170,7 +170,7 @@ def test_options_that_contradict_are_refused(tmp_path: Path, capsys: pytest.Capt
     text = refused(["chirp", "--low-level", "external", "--seed", "5"], capsys)
     assert "--seed: only a simulated robot has this" in text
     (tmp_path / "report.json").write_text(
-        '{"effects": [], "unexplained": {"verdict": "white", "depends_on": []}}'
+        '{"joints": [], "effects": [], "unexplained": {"verdict": "white", "depends_on": []}}'
     )
     text = refused(["chirp", "--after", str(tmp_path / "report.json")], capsys)
     assert "found the motion chirp and --after" in text
