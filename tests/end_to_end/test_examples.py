@@ -132,6 +132,7 @@ LEFT_OUT = {
     "quadvel why fall.mcap": "tests/quadvel_why/test_why.py asks it about a walk and its changes",
     "quadvel why fall.mcap --policy mine.onnx": "the same",
     "quadvel why out/faults/*.mcap": "the same",
+    "quadvel why out/faults/first.mcap out/faults/second.mcap": "the same",
     "quadvel why walk.npz --gains 35 0.5": "the same",
     "quadvel record --ring 30 --out out/faults": "tests/quadvel_bringup/test_recorder.py has a fault recorded",
     "quadvel view --foxglove": "tests/quadvel_view/test_foxglove.py asks such a server",

@@ -1,7 +1,7 @@
 """MuJoCo model of a robot on its ground: its MJCF and the numbers of its `Robot`, joined by MjSpec.
 
-    scene.xml          ground, light, solver, contacts in general
-    robots/*/robot.xml bodies, inertias, joints, shapes
+    scene.xml              ground, light, solver, contacts in general
+    robots/NAME/robot.xml  bodies, inertias, joints, shapes
 
 The caller adds any terrain other than a plane.
 """

@@ -77,8 +77,8 @@ def why_command(
     For example, record until the robot falls, then ask:
       quadvel record --out fall.mcap
       quadvel why fall.mcap
-    all faults that `quadvel record --ring` has recorded:
-      quadvel why out/faults/*.mcap
+    several faults that `quadvel record --ring` has recorded:
+      quadvel why out/faults/first.mcap out/faults/second.mcap
     with a policy of your own, or the log of another robot:
       quadvel why fall.mcap --policy mine.onnx
       quadvel why walk.npz --gains 35 0.5
