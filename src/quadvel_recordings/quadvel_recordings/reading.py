@@ -37,9 +37,8 @@ METADATA_KEYS = {
 }
 """Keys without which metadata.yaml is of no use, and how their values begin."""
 
-# A message names at most so many files.
 MAX_NAMES = 5
-
+"""Most files that a message names; the others are counted."""
 DESCRIPTION_TOPIC = "/robot_description"
 """Topic of the robot's URDF, by which a recording names its robot."""
 

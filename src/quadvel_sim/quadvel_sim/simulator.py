@@ -72,10 +72,10 @@ class Truth:
 
 MAX_PUSH_WEIGHTS = 10.0
 """Largest force of all pushes together, in weights of the robot; some 50 make the physics diverge."""
-MAX_START_DEPTH_M = 0.01
-"""Depth to which a robot may start inside an obstacle, m."""
 MAX_PUSH_ARM_M = 0.2
 """Largest torque of all pushes together, in weights of the robot times 1 m; 0.5 m make it diverge."""
+MAX_START_DEPTH_M = 0.01
+"""Depth to which the lying robot may start inside an obstacle, m; a touch is no mistake of a world."""
 
 
 @attrs.define

@@ -286,9 +286,7 @@ class JointOffset(Cause):
                 size = abs(offset) - 3.0 * fit.errors[3] / fit.command
                 is_clear = fit.errors[3] / fit.command < 0.02 and size > found[0]
                 if is_clear and signals.torque.slow_offset(j) * np.sign(offset) > SLOW_SHARE * abs(offset):
-                    found = max(
-                        found, (size, j, f"{offset:+.3f} rad between the drive's angle and the recorded one")
-                    )
+                    found = (size, j, f"{offset:+.3f} rad between the drive's angle and the recorded one")
         size, j, sentence = found
         if size < self.least and "ground" in signals.parts:
             tried = best_offset(signals.legs)
