@@ -43,6 +43,7 @@ from .search.selection import Search, SearchRecord
 from .statistics.baselines import baseline_errors
 from .statistics.confidence import intervals
 from .statistics.criterion import compare_residuals
+from .statistics.reading_error import reading_errors
 
 _SEARCH_VALUES, _MAX_SEARCH_STEP_S = 30_000, 0.002
 """Number of torque values that the search uses, and the maximum step of its rows, s.
@@ -182,11 +183,14 @@ def _evaluator(prepared: Preprocessed, options: IdentifyOptions) -> tuple[ModelE
     delays = np.stack([eam.input_delay, eam.output_delay])
     plain = Model(prepared.samples, eam.window, eam.gains, one, delays, one)
     noise = noise_variance(prepared.samples, prepared.parts.fit_or_select, plain.residual())
+    reading_error = reading_errors(plain, prepared.parts.fit_or_select)
     # The search uses fewer rows, and none of the held-out logs.
     samples = prepared.samples.drop_heldout(prepared.parts.fit_or_select)
     step = min(round(samples.tau.size / _SEARCH_VALUES), round(_MAX_SEARCH_STEP_S / samples.period))
     samples, rows = samples.thinned(max(step, 1))
-    evaluator = ModelEvaluator(prepared.parts.select_rows(rows), noise, options.cores, options.search)
+    evaluator = ModelEvaluator(
+        prepared.parts.select_rows(rows), noise, reading_error, options.cores, options.search
+    )
     return evaluator, attrs.evolve(plain, samples=samples)
 
 

@@ -47,37 +47,64 @@ def locate(times: Array, at: Array) -> tuple[Indices, Array]:
     return found, share
 
 
-def interpolate(values: Array, row: Indices, share: Array) -> Array:
-    """Interpolate linearly between rows.
+def bend(times: Array, slopes: Array) -> Array:
+    """Compute how far a series with known slopes bends between rows.
+
+    A parabola whose slope changes by D over an interval of length h lies s (1 - s) h D / 2 below the
+    straight line, at the position s from 0 to 1.
+
+    Args:
+        times: (K,) times of the rows, s.
+        slopes: (K, J) slopes of the series at the rows, in its units per second.
+
+    Returns:
+        (K, J) h D / 2 of the interval after each row, 0 for the last one.
+    """
+    found = np.zeros(slopes.shape)
+    found[:-1] = 0.5 * np.diff(times)[:, None] * np.diff(slopes, axis=0)
+    return found
+
+
+def interpolate(values: Array, row: Indices, share: Array, bends: Array | None = None) -> Array:
+    """Interpolate between rows, by straight lines or by parabolas.
 
     Args:
         values: (K, J) values of the rows.
         row: (N,) rows, from `locate`.
         share: (N,) positions, from `locate`.
+        bends: (K, J), from `bend`; None for straight lines.
 
     Returns:
         (N, J) values.
     """
     found = np.empty((len(row), values.shape[1]))
-    _compiled()["read"](values, row, share, found)
+    _compiled()["read"](values, _or_straight(bends, values), row, share, found)
     return found
 
 
-def interpolate_shifted(values: Array, times: Array, at: Array, late: Array) -> Array:
-    """Interpolate linearly at times that differ between joints.
+def _or_straight(bends: Array | None, values: Array) -> Array:
+    """The bends, or 0 for each of the values."""
+    return np.broadcast_to(0.0, values.shape) if bends is None else bends
+
+
+def interpolate_shifted(
+    values: Array, times: Array, at: Array, late: Array, bends: Array | None = None
+) -> Array:
+    """Interpolate at times that differ between joints, by straight lines or by parabolas.
 
     Args:
         values: (K, J) values of the rows.
         times: (K,) times of the rows, s.
         at: (N,) times, s.
         late: (..., J) delay of each joint, s: it is read at `at` - `late`.
+        bends: (K, J), from `bend`; None for straight lines.
 
     Returns:
         (..., N, J) values.
     """
     each = late.reshape(-1, values.shape[1])
     found = np.empty((len(each), len(at), values.shape[1]))
-    _compiled()["read_late"](values, times, at, each, found)
+    _compiled()["read_late"](values, _or_straight(bends, values), times, at, each, found)
     return found.reshape(*late.shape[:-1], *found.shape[1:])
 
 
@@ -132,13 +159,14 @@ def _compiled() -> dict[str, Callable[..., None]]:
             found[n] = here
             share[n] = min(max((at[n] - times[here]) / (times[here + 1] - times[here]), 0.0), 1.0)
 
-    def read(values: Any, row: Any, share: Any, found: Any) -> None:
+    def read(values: Any, bends: Any, row: Any, share: Any, found: Any) -> None:
         for n in range(len(row)):
             for j in range(values.shape[1]):
                 early = values[row[n], j]
-                found[n, j] = early + share[n] * (values[row[n] + 1, j] - early)
+                rise = values[row[n] + 1, j] - early - (1.0 - share[n]) * bends[row[n], j]
+                found[n, j] = early + share[n] * rise
 
-    def read_late(values: Any, times: Any, at: Any, late: Any, found: Any) -> None:
+    def read_late(values: Any, bends: Any, times: Any, at: Any, late: Any, found: Any) -> None:
         for b, j in np.ndindex(late.shape):
             row = 0
             for n in range(len(at)):
@@ -147,7 +175,8 @@ def _compiled() -> dict[str, Callable[..., None]]:
                 here = min(max(row, 0), len(times) - 2)
                 share = min(max((when - times[here]) / (times[here + 1] - times[here]), 0.0), 1.0)
                 early = values[here, j]
-                found[b, n, j] = early + share * (values[here + 1, j] - early)
+                rise = values[here + 1, j] - early - (1.0 - share) * bends[here, j]
+                found[b, n, j] = early + share * rise
 
     def integral(values: Any, sums: Any, times: Any, at: Any, found: Any) -> None:
         row = 0
@@ -162,8 +191,8 @@ def _compiled() -> dict[str, Callable[..., None]]:
     kinds: dict[Callable[..., None], tuple[Any, ...]] = {
         rows_at: (one, one, numba.intp[::1]),
         between: (one, one, numba.intp[::1], numba.float64[::1]),
-        read: (two, rows, one, out),
-        read_late: (two, one, one, two, numba.float64[:, :, ::1]),
+        read: (two, two, rows, one, out),
+        read_late: (two, two, one, one, two, numba.float64[:, :, ::1]),
         integral: (two, two, one, one, out),
     }
     compiled: Any = numba.njit

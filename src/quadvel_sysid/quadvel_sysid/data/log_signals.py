@@ -84,6 +84,7 @@ class LogSignals:
         }
         self.signals: dict[str, Array] = {**self.states, **self.commands, **self.gains}
         self._sharp = sharp
+        self._bends: dict[str, Array] = {}
         self._slopes: dict[float, Array] = {}
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
 
@@ -106,7 +107,7 @@ class LogSignals:
         errors = {"q": self._smoothed(q), "dq": self._smoothed(dq)}  # lines are linear in the values
         other.states = self.states | {name: self.states[name] + error for name, error in errors.items()}
         other.signals = {**self.signals, **other.states}
-        other._slopes, other._smooth = {}, {}
+        other._bends, other._slopes, other._smooth = {}, {}, {}
         return other
 
     def with_shifted_commands(self, shift: float) -> LogSignals:
@@ -153,9 +154,16 @@ class LogSignals:
         Returns:
             (N, J) or (N, 1) values.
         """
-        values = self.states[name]
+        values, bends = self.states[name], self._bend(name)
         values = values if values.shape[1] == 1 else values[:, joints]
-        return interpolation.interpolate(values, *(self.locate(at) if found is None else found))
+        bends = None if bends is None else bends[:, joints]
+        return interpolation.interpolate(values, *(self.locate(at) if found is None else found), bends)
+
+    def _bend(self, name: str) -> Array | None:
+        """How far a state signal bends between rows: of q it follows from dq."""
+        if name == "q" and name not in self._bends:
+            self._bends[name] = interpolation.bend(self.t, self.states["dq"])
+        return self._bends.get(name)
 
     def acceleration_at(self, name: str, at: Array, delays: Array, joints: Joints = ALL_JOINTS) -> Array:
         """Compute the acceleration of the joints.
@@ -214,7 +222,7 @@ class LogSignals:
         Returns:
             (..., N, J) values.
         """
-        return interpolation.interpolate_shifted(self.states[name], self.t, at, late)
+        return interpolation.interpolate_shifted(self.states[name], self.t, at, late, self._bend(name))
 
     def command_rows(self, at: Array) -> Indices:
         """Find the command rows in force.

@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 import attrs
 import numpy as np
 
+from quadvel_description.arrays import Array
+
 from ..logs.findings import Finding
 from ..logs.log import LogError
 from ..options import SEARCH_DEFAULTS, SearchOptions
@@ -148,29 +150,30 @@ def _choose_averaging(
     q_noise, dq_noise = samples.sources.encoder_noise
     noisy = (kp**2 * q_noise + kd**2 * dq_noise).mean() >= _ENCODER_NOISE_SHARE * noise
 
-    def error_of(prepared: Preprocessed) -> float:
-        """Error with friction, N^2 m^2; unless `noisy`, minus the error of the PD law alone."""
-        return _error_with_friction(prepared) - (0.0 if noisy else prepared.eam.mse)
+    def error_of(prepared: Preprocessed) -> Array:
+        """Errors with friction (J,), N^2 m^2; unless `noisy`, minus the mean one of the PD law alone."""
+        return _errors_with_friction(prepared) - (0.0 if noisy else prepared.eam.mse)
 
     chosen, least = 0.0, error_of(prepared)
     widths = _AVERAGING_ROWS * samples.period
     for steady in widths[widths <= (_MAX_AVERAGING_S if noisy else _MAX_AVERAGING_BLURRED_S)]:
         other = fit_logs(steady)
-        error = error_of(other)
-        if error < least - _MIN_AVERAGING_GAIN * noise:
+        error, margin = error_of(other), _MIN_AVERAGING_GAIN * noise
+        # An average that is too wide for the fastest joint would leave an error that effects explain.
+        if error.mean() < least.mean() - margin and (error < least + margin).all():
             prepared, chosen, least = other, float(steady), error
-        elif error > least:
+        elif error.mean() > least.mean():
             break
     return prepared, chosen
 
 
-def _error_with_friction(prepared: Preprocessed) -> float:
-    """Mean squared error (N^2 m^2) of the EAM with friction, which shows noise of dq most."""
+def _errors_with_friction(prepared: Preprocessed) -> Array:
+    """Mean squared errors (J,), N^2 m^2, of the EAM with friction, which shows noise of dq most."""
     samples, eam, rows = prepared.samples, prepared.eam, prepared.parts.fit
     dq = samples.at(eam.input_delay, eam.output_delay, eam.window).dq
-    left, total = samples.tau - eam.predict(samples), 0.0
+    left, errors = samples.tau - eam.predict(samples), np.zeros(rows.shape[1])
     for j, chosen in enumerate(rows.T):
         steps = np.tanh(dq[chosen, j, None] / _FRICTION_WIDTHS_RAD_S)
         r = left[chosen, j] - steps @ np.linalg.lstsq(steps, left[chosen, j], rcond=None)[0]
-        total += float(r @ r)
-    return total / int(rows.sum())
+        errors[j] = np.mean(r**2)
+    return errors

@@ -134,12 +134,14 @@ class ModelEvaluator:
     Attributes:
         parts: Data split.
         noise: Variance of the torque noise, (J,), N^2 m^2.
+        reading_error: Error of the torque that unknown instants of the drive leave, (J,), N^2 m^2.
         cores: Worker processes.
         options: Options of the search.
     """
 
     parts: DataSplit
     noise: Array
+    reading_error: Array
     cores: int = 1
     options: SearchOptions = SEARCH_DEFAULTS
 

@@ -312,7 +312,7 @@ class Search:
         if not self._is_large(comparison):
             return (
                 f"reduces the error of each joint by less than {100 * MIN_REMOVABLE_SHARE:.0f} % of what the plain EAM leaves "
-                "above the noise"
+                "above the noise, or by less than unknown instants of the drive may cause"
             )
         return "" if after.criterion < before.criterion else "its gain is below the cost of its parameters"
 
@@ -360,11 +360,10 @@ class Search:
         """Whether an effect reduces the error of some joint by more than the minimum effect size.
 
         Where the form of a strong effect is not quite right, further effects make up for a per cent of
-        it, with any significance.
+        it, with any significance. Others make up for states that are read at the wrong instant.
         """
-        is_large = (comparison.relative_gain > MIN_EFFECT_SIZE) & (
-            comparison.joint_gain > MIN_REMOVABLE_SHARE * self._removable
-        )
+        least = np.maximum(MIN_REMOVABLE_SHARE * self._removable, self.evaluator.reading_error)
+        is_large = (comparison.relative_gain > MIN_EFFECT_SIZE) & (comparison.joint_gain > least)
         return bool(is_large.any())
 
     def indistinguishable_effects(

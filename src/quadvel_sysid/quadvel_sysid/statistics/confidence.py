@@ -22,11 +22,10 @@ from ..model.delays import delay_flatness
 from ..model.fit import fit, normal_equations, squared_error
 from ..model.jacobian import Unknowns
 from ..model.torque_model import MAX_DELAYS_S, Model
+from .reading_error import CLOCK_ERROR_S
 
 CONFIDENCE_LEVEL = 0.95
 """Coverage of the intervals."""
-_CLOCK_ERROR_S = 0.25e-3
-"""Systematic error of delays and time constants, s: a log does not record the drive's clock."""
 _SYSTEMATIC_FRACTION, _SYSTEMATIC_GAIN_FRACTION = 0.01, 0.005
 """Systematic error relative to an effect's value, and to a gain: motion samples are noisy."""
 _EQUIVALENT_ERROR_RATIO = 1.003
@@ -105,7 +104,7 @@ def intervals(model: Model, parts: DataSplit, noise: Array, clock_offsets: Seque
         known = candidate.sampling_error(effect.parameters, model.signals)
         sampling = np.array([known.get(name, row) for name, row in zip(candidate.names, own, strict=True)])
         clock = np.array(
-            [[_CLOCK_ERROR_S if parameter.unit == "s" else 0.0] for parameter in candidate.parameters]
+            [[CLOCK_ERROR_S if parameter.unit == "s" else 0.0] for parameter in candidate.parameters]
         )
         systematic = np.maximum(clock, _SYSTEMATIC_FRACTION * np.abs(effect.values)) * effect.active
         effects.append(sampling + _form_error(model, index, rows) + systematic)
@@ -114,8 +113,8 @@ def intervals(model: Model, parts: DataSplit, noise: Array, clock_offsets: Seque
     gains = np.minimum(random_error[:2] + _SYSTEMATIC_GAIN_FRACTION * size, np.maximum(1.0, size))
     # The error is flat about the best input delay: the interval holds all of that valley.
     both = covariance.half_widths(np.eye(len(covariance.index))[-2:].sum(axis=0, keepdims=True))
-    delays = np.concatenate([random_error[-2:], both]) + _CLOCK_ERROR_S
-    flat = delay_flatness(model, rows) + _CLOCK_ERROR_S
+    delays = np.concatenate([random_error[-2:], both]) + CLOCK_ERROR_S
+    flat = delay_flatness(model, rows) + CLOCK_ERROR_S
     delays[[0, 2]] = np.maximum(delays[[0, 2]], flat) + max(map(abs, clock_offsets), default=0.0)
     delays = np.minimum(delays, np.append(MAX_DELAYS_S, MAX_DELAYS_S.sum())[:, None])
     return Intervals(
