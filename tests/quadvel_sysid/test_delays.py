@@ -188,7 +188,7 @@ def test_parameters_that_one_frequency_does_not_separate_are_named():
     model = Model(samples, 0.0, np.ones((2, 2)), ONE, np.repeat([[0.001], [0.001]], 2, axis=1), ONE)
     starts = np.arange(0, len(t), 50)
     parts = DataSplit(samples.evaluated, samples.evaluated, samples.evaluated, starts)
-    found = intervals(model, parts, np.full(2, 0.0025))
+    found = intervals(model, parts, np.full(2, 0.0025), np.zeros(2))
     assert ("delta_kd", "output_delay") in [one.names for one in found.inseparable]
     assert (found.total_delay < found.delays[1]).all()
 

@@ -34,14 +34,13 @@ GROUP_OF = {
         (
             *("coulomb_friction", "viscous_friction", "quadratic_drag", "torque_offset"),
             *("parallel_spring", "cogging", "torque_saturation", "first_order_lag", "armature"),
-            "two_logs",
+            *("neighbour_drag", "two_logs"),
         ),
         "alone",
     ),
     "pair": "together",
     "triple": "together",
     "cubic_spring": "outside",
-    "neighbour_drag": "outside",
     "torque_wave": "outside",
 }
 
@@ -200,14 +199,12 @@ def _cogging(machine: Machine, names: list[str], rng: Generator) -> Part:
     return part
 
 
-def _outside(name: str, inner: str, low: float, high: float, neighbour: bool = False) -> Callable[..., Part]:
+def _outside(name: str, inner: str, low: float, high: float) -> Callable[..., Part]:
     """Maker of an effect that the registry does not hold."""
 
     def make(machine: Machine, names: list[str], rng: Generator) -> Part:
         part = _simple(name, {"c": (inner, low, high)})(machine, names, rng)
         key = ["t"] if name == "torque_wave" else ["q"]
-        if neighbour:
-            key = [f"{names[(j + 1) % len(names)]}_joint/dq" for j in part.joints]
         part.signals = {"key": key, "all": [key]}
         return part
 
@@ -225,7 +222,7 @@ MAKERS: dict[str, Callable[..., Part]] = {
     "first_order_lag": _simple("first_order_lag", {"T": ("lag", 0.002, 0.008)}),
     "armature": _armature,
     "cubic_spring": _outside("cubic_spring", "cubic", 4.0, 12.0),
-    "neighbour_drag": _outside("neighbour_drag", "neighbour_drag", 0.1, 0.5, neighbour=True),
+    "neighbour_drag": _simple("neighbour_drag", {"a": ("neighbour_drag", 0.1, 0.5)}, "cross_coupling"),
     "torque_wave": _outside("torque_wave", "wave", 0.1, 0.4),
 }
 

@@ -151,7 +151,7 @@ def _identify_once(dataset: Dataset, options: IdentifyOptions, progress: Progres
         after=after,
         effects_alone=aligned[best_effects][0],
         evidence=_evidence(search, searched.record, chosen, after, parts),
-        half_widths=intervals(after, parts, evaluator.noise, known_offsets(clocks)),
+        half_widths=intervals(after, parts, evaluator.noise, evaluator.reading_error, known_offsets(clocks)),
         noise=evaluator.noise,
         parts=parts,
         base=base,

@@ -25,13 +25,16 @@ from ..statistics.criterion import (
     Comparison,
 )
 from .candidates import EFFECTS, REGRESSORS, Candidates
-from .fitted_model import RIVAL_FRACTION, FittedModel, ModelEvaluator
+from .fitted_model import RIVAL_FRACTION, VARIANCE_FLOOR, FittedModel, ModelEvaluator
 from .regressors import RegressorCandidate
 
 MAX_EFFECTS = 5
 """Maximum number of effects of one log."""
 EQUIVALENCE_MARGIN = 0.02
 """Relative difference of a joint's error below which two effects are indistinguishable."""
+
+MAX_UNEXPLAINED_SHARE = 0.03
+"""Share of what learned terms explain that effects may leave and are still preferred."""
 
 ProgressText = Callable[[str], None]
 
@@ -134,15 +137,32 @@ class Search:
         # Among models with nearly equal criteria the one with the fewest regressors counts.
         models, bound = [regressors], regressors.criterion
         margin = EQUIVALENCE_MARGIN * len(self.evaluator.noise)
-        if effects.is_white or not regressors.is_white or effects.criterion < bound + margin:
+        is_close = effects.criterion < bound + margin or self._explains_nearly_all(effects, regressors, plain)
+        if effects.is_white or not regressors.is_white or is_close:
             effects = self.prune(self.extend(effects, EFFECTS, record, bound=bound))
             models.append(effects)
             if not effects.is_white:
                 models.append(self.extend(effects, REGRESSORS, record, bound=bound))
-        least = min(one.criterion for one in models)
-        equivalent = [one for one in models if one.criterion < least + margin]
+        least = min(models, key=lambda one: one.criterion)
+        equivalent = [
+            one
+            for one in models
+            if one.criterion < least.criterion + margin or self._explains_nearly_all(one, least, plain)
+        ]
         key = _regressor_count if self._options.effects_before_regressors else _criterion
         return SearchResult(self.prune(min(equivalent, key=key)), effects, record)
+
+    def _explains_nearly_all(self, fitted: FittedModel, best: FittedModel, plain: FittedModel) -> bool:
+        """Whether a model leaves a small share of what the best model explains, relative to the noise.
+
+        A learned term adapts to the rows and to the noise of states between them; the form of an
+        effect does not.
+        """
+        left, explained = (
+            np.sum((one.selection_mse - best.selection_mse) / (self.evaluator.noise + VARIANCE_FLOOR))
+            for one in (fitted, plain)
+        )
+        return bool(left <= MAX_UNEXPLAINED_SHARE * explained)
 
     def residual_correlates(self, fitted: FittedModel) -> tuple[str, ...]:
         """Return the signals that the residual depends on, by the score test of a regressor of them.
@@ -362,9 +382,13 @@ class Search:
         Where the form of a strong effect is not quite right, further effects make up for a per cent of
         it, with any significance. Others make up for states that are read at the wrong instant.
         """
-        least = np.maximum(MIN_REMOVABLE_SHARE * self._removable, self.evaluator.reading_error)
-        is_large = (comparison.relative_gain > MIN_EFFECT_SIZE) & (comparison.joint_gain > least)
-        return bool(is_large.any())
+        changed = comparison.noise.any(axis=0)
+        is_large = (comparison.relative_gain > MIN_EFFECT_SIZE) & (
+            comparison.joint_gain > MIN_REMOVABLE_SHARE * self._removable
+        )
+        return bool(is_large.any()) and bool(
+            comparison.joint_gain[changed].sum() > self.evaluator.reading_error[changed].sum()
+        )
 
     def indistinguishable_effects(
         self, fitted: FittedModel, index: int, record: SearchRecord

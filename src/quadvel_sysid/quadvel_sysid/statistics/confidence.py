@@ -20,7 +20,7 @@ from quadvel_description.arrays import Array, Bools, Indices
 from ..data.split import DataSplit
 from ..model.delays import delay_flatness
 from ..model.fit import fit, normal_equations, squared_error
-from ..model.jacobian import Unknowns
+from ..model.jacobian import Unknowns, jacobian
 from ..model.torque_model import MAX_DELAYS_S, Model
 from .reading_error import CLOCK_ERROR_S
 
@@ -32,6 +32,8 @@ _EQUIVALENT_ERROR_RATIO = 1.003
 """Ratio of squared errors below which another form of an effect explains the log equally well."""
 _INSEPARABLE_CORRELATION = 0.95
 """Correlation of two estimates from which a log does not separate the parameters."""
+_COHERENT_SHARE = 0.1
+"""Share of the reading error that a wrong parameter may make up for: the rest changes sign from row to row."""
 
 
 @attrs.frozen
@@ -75,13 +77,20 @@ class Intervals:
     inseparable: tuple[InseparablePair, ...]
 
 
-def intervals(model: Model, parts: DataSplit, noise: Array, clock_offsets: Sequence[float] = ()) -> Intervals:
+def intervals(
+    model: Model,
+    parts: DataSplit,
+    noise: Array,
+    reading_error: Array,
+    clock_offsets: Sequence[float] = (),
+) -> Intervals:
     """Compute confidence intervals of a model that was fitted to the fit and selection rows.
 
     Args:
         model: The fitted model.
         parts: Data split with the clusters.
         noise: Variance of the torque noise, (J,), N^2 m^2.
+        reading_error: Error of the torque that unknown instants of the drive leave, (J,), N^2 m^2.
         clock_offsets: Offsets of the recordings' commands, s; the largest widens the interval of the
             input delay.
 
@@ -90,7 +99,7 @@ def intervals(model: Model, parts: DataSplit, noise: Array, clock_offsets: Seque
     """
     # Half width = random error + error of the effect's form + systematic error.
     rows = parts.fit_or_select
-    covariance = _Covariance.of(model, parts, rows)
+    covariance = _Covariance.of(model, parts, rows, reading_error)
     # What no effect explains can hide in any parameter: the random error grows with it.
     error = squared_error(model, rows) / max(float((noise * rows.sum(axis=0)).sum()), 1e-300)
     covariance = attrs.evolve(covariance, quantile=covariance.quantile * np.sqrt(max(error, 1.0)))
@@ -135,16 +144,20 @@ class _Covariance:
         index: Unknown of slot a on joint j, (A, J); -1 where the slot is not fitted.
         white: Covariance for white residuals, (K, K).
         clustered: Cluster-robust covariance, (K, K).
+        coherent: Squares and products (K, K) of systematic errors from unknown instants of the drive.
+        bias: Largest systematic error (K,) from noise of q and dq that the drive did not act on.
         quantile: Half width of the 95 % interval over the standard deviation.
     """
 
     index: Indices
     white: Array
     clustered: Array
+    coherent: Array
+    bias: Array
     quantile: float
 
     @classmethod
-    def of(cls, model: Model, parts: DataSplit, rows: Bools) -> _Covariance:
+    def of(cls, model: Model, parts: DataSplit, rows: Bools, reading_error: Array) -> _Covariance:
         """Covariance of a model that was fitted to `rows`."""
         unknowns = Unknowns.of(model, all_gains=True)
         hessian, _, slopes, residual = normal_equations(model, unknowns, rows)
@@ -171,7 +184,9 @@ class _Covariance:
         factor = 1.0 + unknowns.count / degrees_of_freedom
         white, clustered = (factor * inverse @ inner @ inverse for inner in (white, sums.T @ sums))
         quantile = stats.t.ppf(0.5 + CONFIDENCE_LEVEL / 2, max(cluster_count - joint_unknowns, 5))
-        return cls(unknowns.index, white, clustered, float(quantile))
+        bias = np.abs(_noise_bias(model, unknowns, rows, hessian, slopes))
+        coherent = _COHERENT_SHARE * float((reading_error * rows.sum(axis=0)).sum()) * inverse
+        return cls(unknowns.index, white, clustered, coherent, bias, float(quantile))
 
     def half_widths(self, sums: Array) -> Array:
         """Half widths (S, J) of weighted sums (S, A) of the slots; slots that are not fitted are known."""
@@ -181,10 +196,12 @@ class _Covariance:
         at = np.where(fitted, self.index, 0).T  # (J, A)
         variance = [
             np.einsum("jsa,jab,jsb->sj", weights, one[at[:, :, None], at[:, None, :]], weights)
-            for one in (self.white, self.clustered)
+            for one in (self.white, self.clustered, self.coherent)
         ]
-        half: Array = self.quantile * np.sqrt(np.maximum(np.maximum(*variance), 0.0))
-        return half
+        random = self.quantile**2 * np.maximum(variance[0], variance[1])
+        half: Array = np.sqrt(np.maximum(random + variance[2], 0.0))
+        biases = np.where(fitted.T, self.bias[at], 0.0)  # (J, A)
+        return half + np.einsum("jsa,ja->sj", np.abs(weights), biases)
 
     def correlations(self, joint: int) -> Array:
         """Correlations (A, A) of the slots of a joint, by the white covariance; 0 where not fitted."""
@@ -194,6 +211,30 @@ class _Covariance:
         deviation = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
         found: Array = covariance / np.maximum(np.outer(deviation, deviation), 1e-300)
         return found
+
+
+def _noise_bias(model: Model, unknowns: Unknowns, rows: Bools, hessian: Array, slopes: Array) -> Array:
+    """Change (K,) of the unknowns if noise of q and dq, which the fit averages, is no gain.
+
+    A fit prefers parameters that average the noise of the states: late speeds plus an inertia of kd
+    times that time predict dq from its neighbours. If the drive acted on other noise than the log
+    has, or on none, that lowers the error and is wrong. Weights of learned terms mean nothing alone.
+    """
+    # With the response d(x) of the prediction to further noise of the states, the error without the
+    # noise of the states is |r(x)|^2 - |d(x)|^2 (errors in variables). At the least squares J'r = 0,
+    # so that one Gauss-Newton step to its minimum is (J'J - D'D)^-1 D'd, with D the derivatives of d.
+    if not model.effects or any(effect.candidate.penalty is not None for effect in model.effects):
+        return np.zeros(unknowns.count)
+    predicted, noisy_slopes = jacobian(attrs.evolve(model, samples=model.samples.noisier), unknowns)
+    response = np.where(rows, predicted - model.predict(), 0.0)
+    change = noisy_slopes * rows.T[:, None] - slopes
+    gradient = unknowns.accumulate((change @ response.T[:, :, None])[..., 0])
+    left = hessian - unknowns.accumulate(change @ change.transpose(0, 2, 1))
+    scale = np.sqrt(np.diagonal(hessian)) + 1e-12
+    step: Array = np.linalg.pinv(left / np.outer(scale, scale), rcond=1e-10, hermitian=True) @ (
+        gradient / scale
+    )
+    return step / scale
 
 
 def _inseparable(model: Model, covariance: _Covariance) -> Iterator[InseparablePair]:

@@ -55,6 +55,8 @@ SAME_COMMAND_CORRELATION = 0.95
 """Commands that correlate more are the same, and their joints cannot be distinguished."""
 UNIT_GAIN_FACTOR = 8.0
 """A gain off by more than this factor is in another unit; 98 % of the joints are within 0.5 to 1.25."""
+_BOUND_QUANTILES = (0.3, 0.5, 0.7, 0.9)
+"""Quantiles of a torque's size at which a bound may lie: a torque that is often at it is noisy there."""
 
 
 @attrs.frozen(eq=False)
@@ -374,6 +376,7 @@ def gain_units(log: Log, found: Response) -> Iterator[Finding | Log]:
         return
     ratio = found.gain / np.where(asked > 0.0, asked, 1.0)
     off = clear & _is_far_off(ratio) & _is_far_off(found.command_gain / np.where(asked > 0.0, asked, 1.0))
+    off &= [not (one and _is_bounded(log, found, j)) for j, one in enumerate(off)]
     if not off.any():
         return
     number, joints = float(np.median(ratio[off])), log.joints_where(off)
@@ -390,6 +393,21 @@ def gain_units(log: Log, found: Response) -> Iterator[Finding | Log]:
     )
     yield Finding("warning", "kp", joints, text)
     yield attrs.evolve(log, kp=None, kd=None)
+
+
+def _is_bounded(log: Log, found: Response, j: int) -> bool:
+    """Whether a bound on the torque that is asked for explains a joint better than another unit does."""
+    assert log.tau is not None
+    assert log.kp is not None
+    row, lags = found.rows, found.lags[(found.lags >= 0.0) & (found.lags <= MAX_DRIVE_DELAY_S)]
+    q, dq, tau = (np.asarray(x[row, j], dtype=float) for x in (log.q, log.dq, log.tau))
+    left = []
+    for lag in lags:
+        k = log.command_rows(log.t[row] - lag + TIME_ROUNDING_S)
+        asked = log.kp[k, j] * (log.q_des[k, j] - q) - (0.0 if log.kd is None else log.kd[k, j] * dq)
+        bounds = np.quantile(np.abs(tau), _BOUND_QUANTILES)
+        left += [np.mean((tau - np.clip(asked, -bound, bound)) ** 2) for bound in bounds]
+    return bool(min(left) < found.min_error_share[j] * np.var(tau))
 
 
 def _is_far_off(ratio: Floats) -> Bools:

@@ -15,6 +15,8 @@ from ...data.signals import Signals
 from ...model.effect_candidate import EffectCandidate, InitialGuess
 
 _STIFFNESSES = (-10.0, -3.0, -1.0, -0.4, 0.4, 1.0, 2.0, 4.0, 10.0, 30.0)  # N m/rad
+_MIN_PERIODS = 1.4
+"""Periods of a cogging torque within the range of motion, at least."""
 _SLOW_REVERSALS = "small slow reversals about many postures, each held for a second"
 _SLOW_SWEEPS = "slow sweeps over the whole range of every joint"
 
@@ -92,9 +94,9 @@ class CoggingCandidate(EffectCandidate):
 
     @override
     def excited_joints(self, p: Mapping[str, Array], s: Signals) -> Bools:
-        """Select joints that moved through a whole period; over less, cogging is any curve."""
-        whole: Bools = np.ptp(s.q, axis=0) * p["n"] >= 2.0 * np.pi
-        return whole
+        """Select joints that moved through enough periods; over less, cogging is any curve."""
+        enough: Bools = np.ptp(s.q, axis=0) * p["n"] >= 2.0 * np.pi * _MIN_PERIODS
+        return enough
 
 
 class DeadbandCandidate(EffectCandidate):
