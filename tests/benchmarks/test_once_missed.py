@@ -68,6 +68,29 @@ def test_the_intervals_contain_the_truth(kind, index, seed, tmp_path):
 
 
 @pytest.mark.parametrize(
+    "index",
+    [
+        8,  # an average over three rows was too wide for the fastest of six joints
+        pytest.param(1, marks=pytest.mark.long),  # instants of the drive alternate by 0.2 ms: a false inertia
+        pytest.param(3, marks=pytest.mark.long),  # speeds between rows that are 20 ms apart are not known
+    ],
+)
+def test_a_log_without_effects_gets_none(index, tmp_path):
+    assert _scored("none", index, 9, tmp_path, "other")["named"] == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "index"),
+    [
+        ("torque_saturation", 3),  # nearly always at its limit: refused for another unit of its gain
+        pytest.param("armature", 6, marks=pytest.mark.long),  # a learned term was 1 % better
+    ],
+)
+def test_the_effect_of_the_second_generator_is_named_correctly(kind, index, tmp_path):
+    assert _scored(kind, index, 9, tmp_path, "other")["verdict"] == "right"
+
+
+@pytest.mark.parametrize(
     ("kind", "index"),
     [
         ("none", 2),  # a filter of angles took over kd, and so had less encoder noise

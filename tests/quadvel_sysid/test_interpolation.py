@@ -44,6 +44,17 @@ def test_values_between_rows_are_linear_and_end_where_the_rows_end(order: str) -
         )
 
 
+def test_a_series_with_known_slopes_is_a_parabola_between_rows() -> None:
+    values, slopes = (np.stack([one, -one]).T for one in (4.0 * TIMES**2 - TIMES, 8.0 * TIMES - 1.0))
+    bends = interpolation.bend(TIMES, slopes)
+    at = EVEN[(EVEN > TIMES[0]) & (EVEN < TIMES[-1])]
+    expected = np.stack([4.0 * at**2 - at, at - 4.0 * at**2]).T
+    found = interpolation.interpolate(values, *interpolation.locate(TIMES, at), bends)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    shifted = interpolation.interpolate_shifted(values, TIMES, at, np.zeros(2), bends)
+    np.testing.assert_allclose(shifted, expected, atol=1e-12)
+
+
 def test_hold_integral_is_the_sum_of_values_times_durations() -> None:
     spacing = np.diff(TIMES, append=TIMES[-1] + 1.0)[:, None]
     sums = np.concatenate([np.zeros((1, 3)), np.cumsum(VALUES * spacing, axis=0)])

@@ -183,9 +183,9 @@ class _Covariance:
         joint_unknowns = int((unknowns.index >= 0).any(axis=1).sum())
         factor = 1.0 + unknowns.count / degrees_of_freedom
         white, clustered = (factor * inverse @ inner @ inverse for inner in (white, sums.T @ sums))
+        coherent = np.asarray(_COHERENT_SHARE * (reading_error * rows.sum(axis=0)).sum() * inverse)
         quantile = stats.t.ppf(0.5 + CONFIDENCE_LEVEL / 2, max(cluster_count - joint_unknowns, 5))
-        bias = np.abs(_noise_bias(model, unknowns, rows, hessian, slopes))
-        coherent = _COHERENT_SHARE * float((reading_error * rows.sum(axis=0)).sum()) * inverse
+        bias: Array = np.abs(_noise_bias(model, unknowns, rows, hessian, slopes))
         return cls(unknowns.index, white, clustered, coherent, bias, float(quantile))
 
     def half_widths(self, sums: Array) -> Array:

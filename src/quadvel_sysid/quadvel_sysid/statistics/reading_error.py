@@ -10,7 +10,6 @@ import numpy as np
 
 from quadvel_description.arrays import Array, Bools
 
-from ..data.differences import difference_variance
 from ..model.torque_model import Model
 
 CLOCK_ERROR_S = 0.25e-3
@@ -41,17 +40,14 @@ def reading_errors(model: Model, rows: Bools) -> Array:
 
 def _interpolation_error(model: Model) -> Array:
     """Mean squared error (N, J), rad^2/s^2, of dq that is interpolated between two rows."""
-    # Let the slope of dq change by k at a random instant of each interval of length h. A straight line
-    # between two rows then has the error (k h)^2 s^2 (1 - s)^2 / 3 at the position s. A line over two
-    # intervals shows k: at the row between them its error e has
-    #     mean e^2 = (k h)^2 / 6 + 1.5 var(noise of dq).
-    # So the error is 2 s^2 (1 - s)^2 (mean e^2 - 1.5 var), where `averaging` is 2 s (1 - s).
+    # Let dq have a new, independent slope from a random instant of each interval of length h on, and let
+    # k^2 be the mean square of the change. A straight line between two rows then has the mean squared
+    # error (k h)^2 s^2 (1 - s)^2 / 3 at the position s. A line over two intervals shows k: its error e at
+    # the row between them has mean e^2 = 5 (k h)^2 / 48, to which noise of dq adds. So the error is at
+    # most 16 / 5 s^2 (1 - s)^2 mean e^2, where `averaging` is 2 s (1 - s).
     samples = model.samples
     at_rows = samples.at(0.0, 0.0, 0.0).dq
     inner = ~(samples.start[1:-1] | samples.start[2:])
     bend = (at_rows[1:-1] - 0.5 * (at_rows[:-2] + at_rows[2:]))[inner]
-    every = np.ones(at_rows.shape, dtype=bool)
-    noise = difference_variance(at_rows, every, samples.start)
-    kinks = np.maximum(np.mean(bend**2, axis=0) - 1.5 * noise, 0.0)
-    error: Array = 0.5 * model.signals.averaging**2 * kinks
+    error: Array = 0.8 * model.signals.averaging**2 * np.mean(bend**2, axis=0)
     return error
