@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 import attrs
 import numpy as np
 
-from quadvel_description.arrays import Array
+from quadvel_description.arrays import Array, Bools
 
 from ..model.applied_effect import AppliedEffect
 from ..model.effect_candidate import EffectCandidate
@@ -329,7 +329,7 @@ class Search:
             )
         if relative_gain <= MIN_EFFECT_SIZE:
             return f"reduces the error of a joint by {100 * relative_gain:.1f} %, below {100 * MIN_EFFECT_SIZE:.0f} %"
-        if not self._is_large(comparison):
+        if not (self._is_large(comparison) if grown else self._is_large_on_a_joint(comparison)):
             return (
                 f"reduces the error of each joint by less than {100 * MIN_REMOVABLE_SHARE:.0f} % of what the plain EAM leaves "
                 "above the noise, or by less than unknown instants of the drive may cause"
@@ -383,12 +383,23 @@ class Search:
         it, with any significance. Others make up for states that are read at the wrong instant.
         """
         changed = comparison.noise.any(axis=0)
-        is_large = (comparison.relative_gain > MIN_EFFECT_SIZE) & (
+        read = self.evaluator.reading_error
+        return bool(
+            self._is_above_form_error(comparison).any()
+            and comparison.joint_gain[changed].sum() > read[changed].sum()
+        )
+
+    def _is_large_on_a_joint(self, comparison: Comparison) -> bool:
+        """The same for gains and delays of each joint, of which all but one may be right already."""
+        above = self._is_above_form_error(comparison)
+        return bool((above & (comparison.joint_gain > self.evaluator.reading_error)).any())
+
+    def _is_above_form_error(self, comparison: Comparison) -> Bools:
+        """Joints (J,) whose error falls by more than a slightly wrong form of another effect makes up."""
+        above: Bools = (comparison.relative_gain > MIN_EFFECT_SIZE) & (
             comparison.joint_gain > MIN_REMOVABLE_SHARE * self._removable
         )
-        return bool(is_large.any()) and bool(
-            comparison.joint_gain[changed].sum() > self.evaluator.reading_error[changed].sum()
-        )
+        return above
 
     def indistinguishable_effects(
         self, fitted: FittedModel, index: int, record: SearchRecord
