@@ -13,6 +13,8 @@ import numpy as np
 
 from quadvel_description.arrays import Array, Indices
 
+_MAX_LEFT_OUT = 1.5
+"""Longest distance between the rows before and after one that is left out, over the median."""
 _MAX_LINEAR_STEPS = 16
 """Steps of linear search before binary search."""
 
@@ -63,6 +65,55 @@ def bend(times: Array, slopes: Array) -> Array:
     found = np.zeros(slopes.shape)
     found[:-1] = 0.5 * np.diff(times)[:, None] * np.diff(slopes, axis=0)
     return found
+
+
+def speed_bend(times: Array, angles: Array, speeds: Array) -> Array:
+    """Compute how far speeds bend between rows, where the angles show it better than noise hides it.
+
+    A parabola of the speed through both rows, whose integral is the change of the angle D, lies
+    3 s (1 - s) (2 D / h - v_0 - v_1) above the straight line at the position s. On slow logs this shows
+    what a command did between two rows; on fast ones it shows noise of the angles.
+
+    Args:
+        times: (K,) times of the rows, s.
+        angles: (K, J), rad.
+        speeds: (K, J), rad/s.
+
+    Returns:
+        (K, J) bends as `interpolate` takes them, rad/s; 0 for joints whose speeds at the rows are nearer
+        to the line between the rows before and after.
+    """
+    straight, curved = left_out_errors(times, angles, speeds)
+    bends = np.zeros(speeds.shape)
+    bends[:-1] = _speed_bend(np.diff(times)[:, None], np.diff(angles, axis=0), speeds[:-1], speeds[1:])
+    return np.where(curved < straight, bends, 0.0)
+
+
+def left_out_errors(times: Array, angles: Array, speeds: Array) -> tuple[Array, Array]:
+    """Predict the speeds of each row from those of the rows before and after.
+
+    Args:
+        times: (K,) times of the rows, s.
+        angles: (K, J), rad.
+        speeds: (K, J), rad/s.
+
+    Returns:
+        Mean squared errors (J,), rad^2/s^2, of a straight line and of the parabola of `speed_bend`.
+    """
+    h = times[2:] - times[:-2]
+    near = h <= _MAX_LEFT_OUT * np.median(h)
+    h = h[:, None]
+    s = (times[1:-1] - times[:-2])[:, None] / h
+    bends = _speed_bend(h, angles[2:] - angles[:-2], speeds[:-2], speeds[2:])
+    straight = speeds[1:-1] - speeds[:-2] - s * (speeds[2:] - speeds[:-2])
+    curved = straight + s * (1.0 - s) * bends
+    return np.mean(straight[near] ** 2, axis=0), np.mean(curved[near] ** 2, axis=0)
+
+
+def _speed_bend(h: Array, turned: Array, before: Array, after: Array) -> Array:
+    """Bends of speeds over intervals of length h in which the angles change by `turned`."""
+    bends: Array = -3.0 * (2.0 * turned / h - before - after)
+    return bends
 
 
 def interpolate(values: Array, row: Indices, share: Array, bends: Array | None = None) -> Array:

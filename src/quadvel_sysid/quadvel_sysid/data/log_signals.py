@@ -56,10 +56,9 @@ class LogSignals:
         """
         self.log, self.origin = log, float(log.t[0]) if log.recording_start is None else log.recording_start
         self.t, self.t_cmd = as_double(log.t), as_double(log.t_cmd)
-        self.states = {"q": as_double(log.q), "dq": as_double(log.dq)}
         self._smoothing = smoothing
         self.smoothed_rows = 2 * round(smoothing / log.period) + 1
-        self.states = {name: self._smoothed(values) for name, values in self.states.items()}
+        self.states = self._smoothed(as_double(log.q), as_double(log.dq))
         if log.temperature is not None:
             self.states["temperature"] = as_double(log.temperature)
         if log.voltage is not None:
@@ -88,9 +87,16 @@ class LogSignals:
         self._slopes: dict[float, Array] = {}
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
 
-    def _smoothed(self, values: Array) -> Array:
-        """Fit lines to the values (N, J) of the rows around each row; return their values there."""
-        return local_lines(self.t, values, self._smoothing)[0] if self._smoothing > 0.0 else values
+    def _smoothed(self, q: Array, dq: Array) -> dict[str, Array]:
+        """Fit lines to q and dq (N, J) of the rows around each row; return their values there."""
+        if self._smoothing <= 0.0:
+            return {"q": q, "dq": dq}
+        # A line through x^2 / 2 is c above it at the middle, so that the line through q lies c ddq above
+        # q. The slope of the line through dq is ddq. Without that, kp c ddq would pass for an inertia.
+        square = 0.5 * (self.t - self.t[0])[:, None] ** 2
+        above = local_lines(self.t, square, self._smoothing)[0] - square
+        (q_line, _), (dq_line, ddq) = (local_lines(self.t, one, self._smoothing) for one in (q, dq))
+        return {"q": q_line - above * ddq, "dq": dq_line}
 
     def with_encoder_errors(self, q: Array, dq: Array) -> LogSignals:
         """Add errors to the measured states.
@@ -104,7 +110,7 @@ class LogSignals:
         """
         other = copy(self)
         other.log = attrs.evolve(self.log, q=self.log.q + q, dq=self.log.dq + dq)
-        errors = {"q": self._smoothed(q), "dq": self._smoothed(dq)}  # lines are linear in the values
+        errors = self._smoothed(q, dq)  # lines are linear in the values
         other.states = self.states | {name: self.states[name] + error for name, error in errors.items()}
         other.signals = {**self.signals, **other.states}
         other._bends, other._slopes, other._smooth = {}, {}, {}
@@ -160,10 +166,17 @@ class LogSignals:
         return interpolation.interpolate(values, *(self.locate(at) if found is None else found), bends)
 
     def _bend(self, name: str) -> Array | None:
-        """How far a state signal bends between rows: of q it follows from dq."""
-        if name == "q" and name not in self._bends:
-            self._bends[name] = interpolation.bend(self.t, self.states["dq"])
+        """How far a state signal bends between rows: q and dq tell it of each other."""
+        if name in ("q", "dq") and name not in self._bends:
+            q, dq = self.states["q"], self.states["dq"]
+            bends = interpolation.bend(self.t, dq) if name == "q" else interpolation.speed_bend(self.t, q, dq)
+            self._bends[name] = bends
         return self._bends.get(name)
+
+    @property
+    def left_out_speed_errors(self) -> tuple[Array, Array]:
+        """Errors (J,) of speeds at rows that are left out, see `interpolation.left_out_errors`."""
+        return interpolation.left_out_errors(self.t, self.states["q"], self.states["dq"])
 
     def acceleration_at(self, name: str, at: Array, delays: Array, joints: Joints = ALL_JOINTS) -> Array:
         """Compute the acceleration of the joints.

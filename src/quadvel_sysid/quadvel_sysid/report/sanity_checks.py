@@ -19,6 +19,7 @@ from ..data.split import DataSplit
 from ..model.torque_model import MAX_DELAYS_S, Model
 from ..search.regressors import RegressorCandidate
 from ..statistics.baselines import FILTER_SPAN_S
+from ..statistics.criterion import MAX_UNEXPLAINED_SHARE
 
 MAX_REPLAY_ERROR_RAD = 1.0
 """Replay error, rad, above which a replay is no evidence for the model."""
@@ -117,7 +118,9 @@ def contradictions(report: Mapping[str, Any]) -> Iterator[str]:
         ("ridge", f"a ridge regression over {1e3 * FILTER_SPAN_S:.0f} ms"),
     ):
         other = report["baselines"][name]["heldout_mse"]
-        if report["effects"] and after["heldout_mse"] > BASELINE_ERROR_RATIO * other:
+        left, explained = (report[one]["heldout_mse"] - other for one in ("after", "before"))
+        is_worse = left > max((BASELINE_ERROR_RATIO - 1.0) * other, MAX_UNEXPLAINED_SHARE * explained)
+        if report["effects"] and is_worse:
             yield (
                 f"{what} has a smaller held-out error, {other:.3g} N^2 m^2, than the corrected model, "
                 f"{after['heldout_mse']:.3g}: the named effects do not describe the joints"

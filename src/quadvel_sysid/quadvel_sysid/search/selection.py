@@ -19,6 +19,7 @@ from ..model.applied_effect import AppliedEffect
 from ..model.effect_candidate import EffectCandidate
 from ..model.torque_model import Model
 from ..statistics.criterion import (
+    MAX_UNEXPLAINED_SHARE,
     MIN_EFFECT_SIZE,
     MIN_REMOVABLE_SHARE,
     SIGNIFICANCE_LEVEL,
@@ -32,9 +33,6 @@ MAX_EFFECTS = 5
 """Maximum number of effects of one log."""
 EQUIVALENCE_MARGIN = 0.02
 """Relative difference of a joint's error below which two effects are indistinguishable."""
-
-MAX_UNEXPLAINED_SHARE = 0.03
-"""Share of what learned terms explain that effects may leave and are still preferred."""
 
 ProgressText = Callable[[str], None]
 
@@ -149,7 +147,7 @@ class Search:
             for one in models
             if one.criterion < least.criterion + margin or self._explains_nearly_all(one, least, plain)
         ]
-        key = _regressor_count if self._options.effects_before_regressors else _criterion
+        key = _regressors_then_groups if self._options.effects_before_regressors else _criterion
         return SearchResult(self.prune(min(equivalent, key=key)), effects, record)
 
     def _explains_nearly_all(self, fitted: FittedModel, best: FittedModel, plain: FittedModel) -> bool:
@@ -293,6 +291,10 @@ class Search:
         limit = before.criterion - RIVAL_FRACTION * max(before.criterion - best, 0.0)
         rivals = self.evaluator.finer_groupings(before, limit)
         candidates = sorted([*fitted.models, *rivals], key=lambda one: one.criterion)
+        if candidates and candidates[0] in rivals and kinds == EFFECTS:
+            # An effect on some joints is simpler than gains of each joint.
+            simpler = [one for one in fitted.models if self._explains_nearly_all(one, candidates[0], before)]
+            candidates.sort(key=lambda one: one not in simpler)
         record.add_rivals(before, candidates)
         accepted = self._first_accepted(before, candidates, fitted.tested_count, record)
         if accepted is None and limit < before.criterion:
@@ -430,15 +432,16 @@ class Search:
         return tuple(dict.fromkeys(found))
 
 
-def _regressor_count(fitted: FittedModel) -> tuple[int, float]:
-    """Number of regressors of named signals, then the criterion: effects are easier to interpret."""
+def _regressors_then_groups(fitted: FittedModel) -> tuple[int, int, float]:
+    """Numbers of regressors and of groups of joints, then the criterion: effects are easier to interpret."""
     count = sum(isinstance(effect.candidate, RegressorCandidate) for effect in fitted.model.effects)
-    return count, fitted.criterion
+    groups = sum(len(np.unique(one)) for one in (fitted.model.gain_groups, fitted.model.delay_groups))
+    return count, groups, fitted.criterion
 
 
-def _criterion(fitted: FittedModel) -> tuple[int, float]:
+def _criterion(fitted: FittedModel) -> tuple[int, int, float]:
     """The criterion alone, as a key."""
-    return 0, fitted.criterion
+    return 0, 0, fitted.criterion
 
 
 def duplicates_effect(effect: AppliedEffect, others: Iterable[AppliedEffect]) -> bool:

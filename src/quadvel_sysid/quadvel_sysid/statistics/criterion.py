@@ -19,6 +19,8 @@ MIN_EFFECT_SIZE = 0.03
 """Minimum error reduction of an effect on one joint, relative to the error that remains."""
 MIN_REMOVABLE_SHARE = 0.01
 """Minimum error reduction of an effect on one joint, relative to what the plain EAM leaves above the noise."""
+MAX_UNEXPLAINED_SHARE = 0.03
+"""Share of what a less simple model explains that effects may leave and are still preferred."""
 PENALTY_PER_PARAMETER = 0.01
 """Minimum relative error reduction per parameter of a joint."""
 

@@ -41,13 +41,15 @@ def reading_errors(model: Model, rows: Bools) -> Array:
 def _interpolation_error(model: Model) -> Array:
     """Mean squared error (N, J), rad^2/s^2, of dq that is interpolated between two rows."""
     # Let dq have a new, independent slope from a random instant of each interval of length h on, and let
-    # k^2 be the mean square of the change. A straight line between two rows then has the mean squared
-    # error (k h)^2 s^2 (1 - s)^2 / 3 at the position s. A line over two intervals shows k: its error e at
-    # the row between them has mean e^2 = 5 (k h)^2 / 48, to which noise of dq adds. So the error is at
-    # most 16 / 5 s^2 (1 - s)^2 mean e^2, where `averaging` is 2 s (1 - s).
-    samples = model.samples
-    at_rows = samples.at(0.0, 0.0, 0.0).dq
-    inner = ~(samples.start[1:-1] | samples.start[2:])
-    bend = (at_rows[1:-1] - 0.5 * (at_rows[:-2] + at_rows[2:]))[inner]
-    error: Array = 0.8 * model.signals.averaging**2 * np.mean(bend**2, axis=0)
+    # k^2 be the mean square of the change. At the position s, with a = 2 s (1 - s) (`averaging`), dq is
+    #     between two rows, by a straight line:     wrong by (k h)^2 a^2 / 12,
+    #     by the parabola of `speed_bend`:          wrong by (k h)^2 a^2 (8 - 15 a) / 240;
+    #     at a row left out, from the rows next to it:  5 (k h)^2 / 48 and (k h)^2 / 240.
+    # The latter are measured, with noise of dq on top; their ratios to the former do not depend on k.
+    series = model.samples.sources.series
+    straight, curved = np.average(
+        [one.left_out_speed_errors for one in series], axis=0, weights=[len(one.t) for one in series]
+    )
+    a = model.signals.averaging
+    error: Array = a**2 * np.where(curved < straight, (8.0 - 15.0 * a) * curved, 0.8 * straight)
     return error
