@@ -22,6 +22,7 @@ from ..statistics.criterion import (
     MAX_UNEXPLAINED_SHARE,
     MIN_EFFECT_SIZE,
     MIN_REMOVABLE_SHARE,
+    READING_ERROR_MARGIN,
     SIGNIFICANCE_LEVEL,
     Comparison,
 )
@@ -385,7 +386,7 @@ class Search:
         it, with any significance. Others make up for states that are read at the wrong instant.
         """
         changed = comparison.noise.any(axis=0)
-        read = self.evaluator.reading_error
+        read = READING_ERROR_MARGIN * self.evaluator.reading_error
         return bool(
             self._is_above_form_error(comparison).any()
             and comparison.joint_gain[changed].sum() > read[changed].sum()
@@ -394,7 +395,8 @@ class Search:
     def _is_large_on_a_joint(self, comparison: Comparison) -> bool:
         """The same for gains and delays of each joint, of which all but one may be right already."""
         above = self._is_above_form_error(comparison)
-        return bool((above & (comparison.joint_gain > self.evaluator.reading_error)).any())
+        read = READING_ERROR_MARGIN * self.evaluator.reading_error
+        return bool((above & (comparison.joint_gain > read)).any())
 
     def _is_above_form_error(self, comparison: Comparison) -> Bools:
         """Joints (J,) whose error falls by more than a slightly wrong form of another effect makes up."""

@@ -21,6 +21,12 @@ MIN_REMOVABLE_SHARE = 0.01
 """Minimum error reduction of an effect on one joint, relative to what the plain EAM leaves above the noise."""
 MAX_UNEXPLAINED_SHARE = 0.03
 """Share of what a less simple model explains that effects may leave and are still preferred."""
+READING_ERROR_MARGIN = 2.0
+"""Minimum error reduction of an effect, relative to the reading error of its joints.
+
+Speeds between slow rows are 0.6 to 4.8 times as wrong (mean square) as their estimate, on logs of the
+second generator.
+"""
 PENALTY_PER_PARAMETER = 0.01
 """Minimum relative error reduction per parameter of a joint."""
 
