@@ -13,6 +13,10 @@ import numpy as np
 
 from quadvel_description.arrays import Array, Indices
 
+MAX_CURVED_ERROR = 0.5
+"""Largest error of parabolas at rows that are left out, over that of lines: 0.75 for noise of dq alone, 0.04
+for slopes that jump.
+"""
 _MAX_LEFT_OUT = 1.5
 """Longest distance between the rows before and after one that is left out, over the median."""
 _MAX_LINEAR_STEPS = 16
@@ -80,13 +84,13 @@ def speed_bend(times: Array, angles: Array, speeds: Array) -> Array:
         speeds: (K, J), rad/s.
 
     Returns:
-        (K, J) bends as `interpolate` takes them, rad/s; 0 for joints whose speeds at the rows are nearer
-        to the line between the rows before and after.
+        (K, J) bends as `interpolate` takes them, rad/s; 0 for joints whose rows, left out, are not clearly
+        nearer to the parabola than to the line.
     """
     straight, curved = left_out_errors(times, angles, speeds)
     bends = np.zeros(speeds.shape)
     bends[:-1] = _speed_bend(np.diff(times)[:, None], np.diff(angles, axis=0), speeds[:-1], speeds[1:])
-    return np.where(curved < straight, bends, 0.0)
+    return np.where(curved < MAX_CURVED_ERROR * straight, bends, 0.0)
 
 
 def left_out_errors(times: Array, angles: Array, speeds: Array) -> tuple[Array, Array]:

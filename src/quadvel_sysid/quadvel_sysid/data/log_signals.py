@@ -91,12 +91,8 @@ class LogSignals:
         """Fit lines to q and dq (N, J) of the rows around each row; return their values there."""
         if self._smoothing <= 0.0:
             return {"q": q, "dq": dq}
-        # A line through x^2 / 2 is c above it at the middle, so that the line through q lies c ddq above
-        # q. The slope of the line through dq is ddq. Without that, kp c ddq would pass for an inertia.
-        square = 0.5 * (self.t - self.t[0])[:, None] ** 2
-        above = local_lines(self.t, square, self._smoothing)[0] - square
-        (q_line, _), (dq_line, ddq) = (local_lines(self.t, one, self._smoothing) for one in (q, dq))
-        return {"q": q_line - above * ddq, "dq": dq_line}
+        q, dq = (local_lines(self.t, one, self._smoothing)[0] for one in (q, dq))
+        return {"q": q, "dq": dq}
 
     def with_encoder_errors(self, q: Array, dq: Array) -> LogSignals:
         """Add errors to the measured states.

@@ -10,6 +10,7 @@ import numpy as np
 
 from quadvel_description.arrays import Array, Bools
 
+from ..data.interpolation import MAX_CURVED_ERROR
 from ..model.torque_model import Model
 
 CLOCK_ERROR_S = 0.25e-3
@@ -51,5 +52,7 @@ def _interpolation_error(model: Model) -> Array:
         [one.left_out_speed_errors for one in series], axis=0, weights=[len(one.t) for one in series]
     )
     a = model.signals.averaging
-    error: Array = a**2 * np.where(curved < straight, (8.0 - 15.0 * a) * curved, 0.8 * straight)
+    error: Array = a**2 * np.where(
+        curved < MAX_CURVED_ERROR * straight, (8.0 - 15.0 * a) * curved, 0.8 * straight
+    )
     return error
