@@ -61,7 +61,7 @@ def test_parameters_that_hold_a_log_have_the_name_of_its_record() -> None:
 
 def test_the_tuned_constants_have_the_documented_values() -> None:
     rows = re.findall(r"^\| `([\w.]+)\.(\w+)` \| ([\d.]+) \|", PAGE.read_text(), re.MULTILINE)
-    assert len(rows) == 31
+    assert len(rows) == 37
     for module, name, value in rows:
         owner = (
             SEARCH_DEFAULTS if module == "options.SearchOptions" else import_module(f"quadvel_sysid.{module}")
