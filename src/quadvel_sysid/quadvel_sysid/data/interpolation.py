@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from quadvel_description.arrays import Array, Indices
+from quadvel_description.arrays import Array, Bools, Indices
 
 MAX_CURVED_ERROR = 0.5
 """Largest error of parabolas at rows that are left out, over that of lines: 0.75 for noise of dq alone, 0.04
@@ -72,7 +72,7 @@ def bend(times: Array, slopes: Array) -> Array:
 
 
 def speed_bend(times: Array, angles: Array, speeds: Array) -> Array:
-    """Compute how far speeds bend between rows, where the angles show it better than noise hides it.
+    """Compute how far speeds bend between rows, as the angles show it.
 
     A parabola of the speed through both rows, whose integral is the change of the angle D, lies
     3 s (1 - s) (2 D / h - v_0 - v_1) above the straight line at the position s. On slow logs this shows
@@ -84,13 +84,27 @@ def speed_bend(times: Array, angles: Array, speeds: Array) -> Array:
         speeds: (K, J), rad/s.
 
     Returns:
-        (K, J) bends as `interpolate` takes them, rad/s; 0 for joints whose rows, left out, are not clearly
-        nearer to the parabola than to the line.
+        (K, J) bends as `interpolate` takes them, rad/s.
     """
-    straight, curved = left_out_errors(times, angles, speeds)
     bends = np.zeros(speeds.shape)
     bends[:-1] = _speed_bend(np.diff(times)[:, None], np.diff(angles, axis=0), speeds[:-1], speeds[1:])
-    return np.where(curved < MAX_CURVED_ERROR * straight, bends, 0.0)
+    return bends
+
+
+def bends_visibly(times: Array, angles: Array, speeds: Array) -> Bools:
+    """Find the joints whose rows, left out, are clearly nearer to the parabola than to the line.
+
+    Args:
+        times: (K,) times of the rows, s.
+        angles: (K, J), rad.
+        speeds: (K, J), rad/s.
+
+    Returns:
+        (J,) bool.
+    """
+    straight, curved = left_out_errors(times, angles, speeds)
+    found: Bools = curved < MAX_CURVED_ERROR * straight
+    return found
 
 
 def left_out_errors(times: Array, angles: Array, speeds: Array) -> tuple[Array, Array]:

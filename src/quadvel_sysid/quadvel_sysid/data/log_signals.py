@@ -14,7 +14,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.arrays import Array, Indices
+from quadvel_description.arrays import Array, Bools, Indices
 
 from ..logs.log import TIME_TOLERANCE_S, Log
 from . import interpolation
@@ -41,6 +41,7 @@ class LogSignals:
         gains: kp and kd, (M, J); 1 if they are not known.
         sums: Integral (M + 1, J) of each command signal that is not 0.
         smoothed_rows: Number of rows over which q and dq are averaged; 1 without smoothing.
+        curved: Joints (J,) whose dq is read by parabolas between rows, also with further errors.
         signals: All of these signals by name.
     """
 
@@ -83,6 +84,7 @@ class LogSignals:
         }
         self.signals: dict[str, Array] = {**self.states, **self.commands, **self.gains}
         self._sharp = sharp
+        self.curved: Bools = interpolation.bends_visibly(self.t, self.states["q"], self.states["dq"])
         self._bends: dict[str, Array] = {}
         self._slopes: dict[float, Array] = {}
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
@@ -165,8 +167,10 @@ class LogSignals:
         """How far a state signal bends between rows: q and dq tell it of each other."""
         if name in ("q", "dq") and name not in self._bends:
             q, dq = self.states["q"], self.states["dq"]
-            bends = interpolation.bend(self.t, dq) if name == "q" else interpolation.speed_bend(self.t, q, dq)
-            self._bends[name] = bends
+            if name == "q":
+                self._bends[name] = interpolation.bend(self.t, dq)
+            else:
+                self._bends[name] = np.where(self.curved, interpolation.speed_bend(self.t, q, dq), 0.0)
         return self._bends.get(name)
 
     @property

@@ -10,7 +10,7 @@ import numpy as np
 
 from quadvel_description.arrays import Array, Bools
 
-from ..data.interpolation import MAX_CURVED_ERROR
+from ..data.log_signals import LogSignals
 from ..model.torque_model import Model
 
 CLOCK_ERROR_S = 0.25e-3
@@ -47,12 +47,14 @@ def _interpolation_error(model: Model) -> Array:
     #     by the parabola of `speed_bend`:          wrong by (k h)^2 a^2 (8 - 15 a) / 240;
     #     at a row left out, from the rows next to it:  5 (k h)^2 / 48 and (k h)^2 / 240.
     # The latter are measured, with noise of dq on top; their ratios to the former do not depend on k.
-    series = model.samples.sources.series
-    straight, curved = np.average(
-        [one.left_out_speed_errors for one in series], axis=0, weights=[len(one.t) for one in series]
-    )
-    a = model.signals.averaging
-    error: Array = a**2 * np.where(
-        curved < MAX_CURVED_ERROR * straight, (8.0 - 15.0 * a) * curved, 0.8 * straight
-    )
+    series, a = model.samples.sources.series, model.signals.averaging
+    weights = [len(one.t) for one in series]
+    straight, curved = np.average([_left_out(one) for one in series], axis=0, weights=weights)
+    error: Array = a**2 * (0.8 * straight + (8.0 - 15.0 * a) * curved)
     return error
+
+
+def _left_out(series: LogSignals) -> tuple[Array, Array]:
+    """Errors (J,) of lines and of parabolas at rows that are left out, each 0 where it is not used."""
+    straight, curved = series.left_out_speed_errors
+    return np.where(series.curved, 0.0, straight), np.where(series.curved, curved, 0.0)
