@@ -224,18 +224,20 @@ class LogSignals:
                 found[:, joints] = read(values, sums, at - delay)
         return found
 
-    def state_shifted(self, name: str, at: Array, late: Array) -> Array:
+    def state_shifted(self, name: str, at: Array, late: Array, curved: bool = False) -> Array:
         """Interpolate a state signal at delays that differ between joints.
 
         Args:
             name: Name of the signal.
             at: (N,) times, s.
             late: (..., J) delays, s; values are those at `at` minus these.
+            curved: Whether it bends between rows, as in `state_at`; straight lines if not.
 
         Returns:
             (..., N, J) values.
         """
-        return interpolation.interpolate_shifted(self.states[name], self.t, at, late, self._bend(name))
+        bends = self._bend(name) if curved else None
+        return interpolation.interpolate_shifted(self.states[name], self.t, at, late, bends)
 
     def command_rows(self, at: Array) -> Indices:
         """Find the command rows in force.

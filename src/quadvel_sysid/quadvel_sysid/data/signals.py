@@ -539,13 +539,29 @@ class Samples:
             yield one.t[self.row[a:b] - first] - self.lead[a:b] - output_delay
 
     def _shifted_state(self, output_delay: Array | float, name: str, late: Array) -> Array:
-        """A state signal (..., N, J) of all rows, `late` s before the instants at this output delay."""
+        """A state signal (..., N, J) of all rows, `late` s before the instants at this output delay.
+
+        The shift follows straight lines between rows, as in a running model.
+        """
         before = np.squeeze(late, -2) if np.ndim(late) > 1 else late
         before = np.broadcast_to(
             before + output_delay, np.broadcast_shapes(np.shape(before), self.tau.shape[1:])
         )
+        return self._state_before(name, before) + self._bend_at(name, output_delay)
+
+    def _bend_at(self, name: str, output_delay: Array | float) -> Array:
+        """By how much a state signal (N, J) differs from straight lines at this output delay."""
+        delays = np.broadcast_to(output_delay, self.tau.shape[1:])
+
+        def make() -> dict[str, Array]:
+            return {name: self._state_before(name, delays, True) - self._state_before(name, delays)}
+
+        return self._cached(self._states, (name, *delays.tolist()), make)[name]
+
+    def _state_before(self, name: str, late: Array, curved: bool = False) -> Array:
+        """A state signal (..., N, J) of all rows, `late` (..., J) s before them."""
         parts = [
-            one.state_shifted(name, at, before)
+            one.state_shifted(name, at, late, curved)
             for one, at in zip(self.sources.series, self._request_times(0.0), strict=True)
         ]
         return np.concatenate(parts, axis=-2)

@@ -32,6 +32,8 @@ _EQUIVALENT_ERROR_RATIO = 1.003
 """Ratio of squared errors below which another form of an effect explains the log equally well."""
 _INSEPARABLE_CORRELATION = 0.95
 """Correlation of two estimates from which a log does not separate the parameters."""
+_SPLIT_CHANGES_S = 0.5e-3 * np.array([-6, -4, -3, -2, -1, 1, 2, 3, 4, 6])
+"""Changes of the output delay, s, at which effects are fitted again for their intervals."""
 _COHERENT_SHARE = 0.1
 """Share of the reading error that a wrong parameter may make up for: the rest changes sign from row to row."""
 
@@ -104,6 +106,8 @@ def intervals(
     error = squared_error(model, rows) / max(float((noise * rows.sum(axis=0)).sum()), 1e-300)
     covariance = attrs.evolve(covariance, quantile=covariance.quantile * np.sqrt(max(error, 1.0)))
     random_error = covariance.half_widths(np.eye(len(covariance.index)))
+    allowed = _COHERENT_SHARE * float((reading_error * rows.sum(axis=0)).sum())
+    split_error = _split_error(model, rows, allowed + covariance.quantile**2 * float(noise.mean()))
     effects, first = [], 2
     for index, effect in enumerate(model.effects):
         own = random_error[first : first + len(effect.values)]
@@ -116,6 +120,7 @@ def intervals(
             [[CLOCK_ERROR_S if parameter.unit == "s" else 0.0] for parameter in candidate.parameters]
         )
         systematic = np.maximum(clock, _SYSTEMATIC_FRACTION * np.abs(effect.values)) * effect.active
+        sampling = np.maximum(sampling, split_error[index])
         effects.append(sampling + _form_error(model, index, rows) + systematic)
     # A half width as large as the gain (or 1) means that any gain from 0 on is possible.
     size = np.abs(model.gains)
@@ -275,6 +280,24 @@ def _form_error(model: Model, index: int, rows: Bools) -> Array:
             if squared_error(other, rows) < bound:
                 change = np.maximum(change, np.abs(other.effects[index].values - effect.values))
     return change
+
+
+def _split_error(model: Model, rows: Bools, allowed: float) -> list[Array]:
+    """Largest changes (P, J) of each effect's values at other splits of the delays that are nearly as good.
+
+    An inertia, kd and the output delay make up for each other far beyond the linear range, and the
+    delay may lie at its bound. `allowed` is the increase of the sum of squares, N^2 m^2.
+    """
+    changes = [np.zeros(effect.values.shape) for effect in model.effects]
+    if any(effect.candidate.confounded_with_delays for effect in model.effects):
+        limit, total = squared_error(model, rows) + allowed, model.delays.sum(axis=0)
+        for change in _SPLIT_CHANGES_S:
+            output = np.clip(model.delays[1] + change, 0.0, np.minimum(total, MAX_DELAYS_S[1]))
+            other = fit(model.with_delays(np.stack([total - output, output])), rows, delays=False)
+            if squared_error(other, rows) < limit:
+                for k, (mine, its) in enumerate(zip(model.effects, other.effects, strict=True)):
+                    changes[k] = np.maximum(changes[k], np.abs(its.values - mine.values))
+    return changes
 
 
 def parameters_at_bound(model: Model) -> tuple[str, ...]:
