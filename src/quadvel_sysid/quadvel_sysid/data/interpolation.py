@@ -13,9 +13,9 @@ import numpy as np
 
 from quadvel_description.arrays import Array, Bools, Indices
 
-MAX_CURVED_ERROR = 0.5
+MAX_CURVED_ERROR = 0.1
 """Largest error of parabolas at rows that are left out, over that of lines: 0.75 for noise of dq alone, 0.04
-for slopes that jump.
+for slopes that jump. Near a row the noise of q counts more than at a row that is left out.
 """
 _MAX_LEFT_OUT = 1.5
 """Longest distance between the rows before and after one that is left out, over the median."""
