@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from quadvel_description.arrays import Array, Bools, Indices
+from quadvel_description.arrays import Array, Indices
 
 MAX_CURVED_ERROR = 0.1
 """Largest error of parabolas at rows that are left out, over that of lines: 0.75 for noise of dq alone, 0.04
@@ -89,22 +89,6 @@ def speed_bend(times: Array, angles: Array, speeds: Array) -> Array:
     bends = np.zeros(speeds.shape)
     bends[:-1] = _speed_bend(np.diff(times)[:, None], np.diff(angles, axis=0), speeds[:-1], speeds[1:])
     return bends
-
-
-def bends_visibly(times: Array, angles: Array, speeds: Array) -> Bools:
-    """Find the joints whose rows, left out, are clearly nearer to the parabola than to the line.
-
-    Args:
-        times: (K,) times of the rows, s.
-        angles: (K, J), rad.
-        speeds: (K, J), rad/s.
-
-    Returns:
-        (J,) bool.
-    """
-    straight, curved = left_out_errors(times, angles, speeds)
-    found: Bools = curved < MAX_CURVED_ERROR * straight
-    return found
 
 
 def left_out_errors(times: Array, angles: Array, speeds: Array) -> tuple[Array, Array]:

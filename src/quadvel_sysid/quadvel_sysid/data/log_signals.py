@@ -41,7 +41,8 @@ class LogSignals:
         gains: kp and kd, (M, J); 1 if they are not known.
         sums: Integral (M + 1, J) of each command signal that is not 0.
         smoothed_rows: Number of rows over which q and dq are averaged; 1 without smoothing.
-        curved: Joints (J,) whose dq is read by parabolas between rows, also with further errors.
+        left_out_speed_errors: Errors (J,) of lines and of parabolas at rows that are left out, from
+            `interpolation.left_out_errors`; those of the log also where errors are added to it.
         signals: All of these signals by name.
     """
 
@@ -57,9 +58,11 @@ class LogSignals:
         """
         self.log, self.origin = log, float(log.t[0]) if log.recording_start is None else log.recording_start
         self.t, self.t_cmd = as_double(log.t), as_double(log.t_cmd)
+        self.states = {"q": as_double(log.q), "dq": as_double(log.dq)}
         self._smoothing = smoothing
         self.smoothed_rows = 2 * round(smoothing / log.period) + 1
-        self.states = self._smoothed(as_double(log.q), as_double(log.dq))
+        self.states = {name: self._smoothed(values) for name, values in self.states.items()}
+        self.left_out_speed_errors = interpolation.left_out_errors(self.t, *self.states.values())
         if log.temperature is not None:
             self.states["temperature"] = as_double(log.temperature)
         if log.voltage is not None:
@@ -84,17 +87,13 @@ class LogSignals:
         }
         self.signals: dict[str, Array] = {**self.states, **self.commands, **self.gains}
         self._sharp = sharp
-        self.curved: Bools = interpolation.bends_visibly(self.t, self.states["q"], self.states["dq"])
         self._bends: dict[str, Array] = {}
         self._slopes: dict[float, Array] = {}
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
 
-    def _smoothed(self, q: Array, dq: Array) -> dict[str, Array]:
-        """Fit lines to q and dq (N, J) of the rows around each row; return their values there."""
-        if self._smoothing <= 0.0:
-            return {"q": q, "dq": dq}
-        q, dq = (local_lines(self.t, one, self._smoothing)[0] for one in (q, dq))
-        return {"q": q, "dq": dq}
+    def _smoothed(self, values: Array) -> Array:
+        """Fit lines to the values (N, J) of the rows around each row; return their values there."""
+        return local_lines(self.t, values, self._smoothing)[0] if self._smoothing > 0.0 else values
 
     def with_encoder_errors(self, q: Array, dq: Array) -> LogSignals:
         """Add errors to the measured states.
@@ -108,7 +107,7 @@ class LogSignals:
         """
         other = copy(self)
         other.log = attrs.evolve(self.log, q=self.log.q + q, dq=self.log.dq + dq)
-        errors = self._smoothed(q, dq)  # lines are linear in the values
+        errors = {"q": self._smoothed(q), "dq": self._smoothed(dq)}  # lines are linear in the values
         other.states = self.states | {name: self.states[name] + error for name, error in errors.items()}
         other.signals = {**self.signals, **other.states}
         other._bends, other._slopes, other._smooth = {}, {}, {}
@@ -165,18 +164,18 @@ class LogSignals:
 
     def _bend(self, name: str) -> Array | None:
         """How far a state signal bends between rows: q and dq tell it of each other."""
-        if name in ("q", "dq") and name not in self._bends:
+        if not self._bends:
             q, dq = self.states["q"], self.states["dq"]
-            if name == "q":
-                self._bends[name] = interpolation.bend(self.t, dq)
-            else:
-                self._bends[name] = np.where(self.curved, interpolation.speed_bend(self.t, q, dq), 0.0)
+            self._bends["q"] = interpolation.bend(self.t, dq)
+            self._bends["dq"] = np.where(self.curved, interpolation.speed_bend(self.t, q, dq), 0.0)
         return self._bends.get(name)
 
     @property
-    def left_out_speed_errors(self) -> tuple[Array, Array]:
-        """Errors (J,) of speeds at rows that are left out, see `interpolation.left_out_errors`."""
-        return interpolation.left_out_errors(self.t, self.states["q"], self.states["dq"])
+    def curved(self) -> Bools:
+        """Joints (J,) whose dq is read by parabolas between rows."""
+        straight, curved = self.left_out_speed_errors
+        found: Bools = curved < interpolation.MAX_CURVED_ERROR * straight
+        return found
 
     def acceleration_at(self, name: str, at: Array, delays: Array, joints: Joints = ALL_JOINTS) -> Array:
         """Compute the acceleration of the joints.

@@ -33,7 +33,7 @@ TRIAL_ITERATIONS = 4
 """Steps of a fit that show which of several models or starts is worth a whole fit."""
 RIVAL_FRACTION = 0.5
 """Fraction of the best candidate's gain above which another candidate is its rival."""
-VARIANCE_FLOOR = 1e-12
+_VARIANCE_FLOOR = 1e-12
 """Added to variances, N^2 m^2, for logs without noise."""
 
 
@@ -79,8 +79,14 @@ class FittedModel:
     @property
     def log_errors(self) -> Array:
         """Logarithm of each joint's error on the selection rows, relative to the noise, (J,)."""
-        noise = self.evaluator.noise + VARIANCE_FLOOR
-        found: Array = np.log((self.selection_mse + VARIANCE_FLOOR) / noise)
+        found: Array = np.log(self.relative_errors)
+        return found
+
+    @property
+    def relative_errors(self) -> Array:
+        """Each joint's error on the selection rows, relative to the noise, (J,)."""
+        noise = self.evaluator.noise + _VARIANCE_FLOOR
+        found: Array = (self.selection_mse + _VARIANCE_FLOOR) / noise
         return found
 
     def compare_with(self, before: FittedModel) -> Comparison:
@@ -195,7 +201,7 @@ class ModelEvaluator:
         # steps show.
         errors = expected_errors([model, *finer], self.parts.fit)
         change = [
-            float(np.log(error + VARIANCE_FLOOR).sum() - np.log(errors[0] + VARIANCE_FLOOR).sum())
+            float(np.log(error + _VARIANCE_FLOOR).sum() - np.log(errors[0] + _VARIANCE_FLOOR).sum())
             + PENALTY_PER_PARAMETER * (self._parameter_count(one) - self._parameter_count(model))
             for one, error in zip(finer, errors[1:], strict=True)
         ]

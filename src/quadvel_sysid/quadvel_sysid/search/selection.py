@@ -27,7 +27,7 @@ from ..statistics.criterion import (
     Comparison,
 )
 from .candidates import EFFECTS, REGRESSORS, Candidates
-from .fitted_model import RIVAL_FRACTION, VARIANCE_FLOOR, FittedModel, ModelEvaluator
+from .fitted_model import RIVAL_FRACTION, FittedModel, ModelEvaluator
 from .regressors import RegressorCandidate
 
 MAX_EFFECTS = 5
@@ -135,21 +135,21 @@ class Search:
             regressors = self.extend(regressors, REGRESSORS, record)
         # Among models with nearly equal criteria the one with the fewest regressors counts.
         models, bound = [regressors], regressors.criterion
-        margin = EQUIVALENCE_MARGIN * len(self.evaluator.noise)
-        is_close = effects.criterion < bound + margin or self._explains_nearly_all(effects, regressors, plain)
+        is_close = self._is_nearly_as_good(effects, regressors, plain)
         if effects.is_white or not regressors.is_white or is_close:
             effects = self.prune(self.extend(effects, EFFECTS, record, bound=bound))
             models.append(effects)
             if not effects.is_white:
                 models.append(self.extend(effects, REGRESSORS, record, bound=bound))
         least = min(models, key=lambda one: one.criterion)
-        equivalent = [
-            one
-            for one in models
-            if one.criterion < least.criterion + margin or self._explains_nearly_all(one, least, plain)
-        ]
+        equivalent = [one for one in models if self._is_nearly_as_good(one, least, plain)]
         key = _regressors_then_groups if self._options.effects_before_regressors else _criterion
         return SearchResult(self.prune(min(equivalent, key=key)), effects, record)
+
+    def _is_nearly_as_good(self, fitted: FittedModel, best: FittedModel, plain: FittedModel) -> bool:
+        """Whether a model is preferred to the best one if it is simpler."""
+        margin = EQUIVALENCE_MARGIN * len(self.evaluator.noise)
+        return fitted.criterion < best.criterion + margin or self._explains_nearly_all(fitted, best, plain)
 
     def _explains_nearly_all(self, fitted: FittedModel, best: FittedModel, plain: FittedModel) -> bool:
         """Whether a model leaves a small share of what the best model explains, relative to the noise.
@@ -158,10 +158,9 @@ class Search:
         effect does not.
         """
         left, explained = (
-            np.sum((one.selection_mse - best.selection_mse) / (self.evaluator.noise + VARIANCE_FLOOR))
-            for one in (fitted, plain)
+            float(np.sum(one.relative_errors - best.relative_errors)) for one in (fitted, plain)
         )
-        return bool(left <= MAX_UNEXPLAINED_SHARE * explained)
+        return left <= MAX_UNEXPLAINED_SHARE * explained
 
     def residual_correlates(self, fitted: FittedModel) -> tuple[str, ...]:
         """Return the signals that the residual depends on, by the score test of a regressor of them.

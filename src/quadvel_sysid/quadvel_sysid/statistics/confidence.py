@@ -32,7 +32,7 @@ _EQUIVALENT_ERROR_RATIO = 1.003
 """Ratio of squared errors below which another form of an effect explains the log equally well."""
 _INSEPARABLE_CORRELATION = 0.95
 """Correlation of two estimates from which a log does not separate the parameters."""
-_SPLIT_CHANGES_S = 0.5e-3 * np.array([-6, -4, -3, -2, -1, 1, 2, 3, 4, 6])
+_OUTPUT_DELAY_CHANGES_S = 0.5e-3 * np.array([-6, -4, -3, -2, -1, 1, 2, 3, 4, 6])
 """Changes of the output delay, s, at which effects are fitted again for their intervals."""
 _COHERENT_SHARE = 0.1
 """Share of the reading error that a wrong parameter may make up for: the rest changes sign from row to row."""
@@ -101,13 +101,13 @@ def intervals(
     """
     # Half width = random error + error of the effect's form + systematic error.
     rows = parts.fit_or_select
-    covariance = _Covariance.of(model, parts, rows, reading_error)
+    coherent = _COHERENT_SHARE * float((reading_error * rows.sum(axis=0)).sum())
+    covariance = _Covariance.of(model, parts, rows, coherent)
     # What no effect explains can hide in any parameter: the random error grows with it.
     error = squared_error(model, rows) / max(float((noise * rows.sum(axis=0)).sum()), 1e-300)
     covariance = attrs.evolve(covariance, quantile=covariance.quantile * np.sqrt(max(error, 1.0)))
     random_error = covariance.half_widths(np.eye(len(covariance.index)))
-    allowed = _COHERENT_SHARE * float((reading_error * rows.sum(axis=0)).sum())
-    split_error = _split_error(model, rows, allowed + covariance.quantile**2 * float(noise.mean()))
+    split_error = _split_error(model, rows, coherent + covariance.quantile**2 * float(noise.mean()))
     effects, first = [], 2
     for index, effect in enumerate(model.effects):
         own = random_error[first : first + len(effect.values)]
@@ -162,8 +162,8 @@ class _Covariance:
     quantile: float
 
     @classmethod
-    def of(cls, model: Model, parts: DataSplit, rows: Bools, reading_error: Array) -> _Covariance:
-        """Covariance of a model that was fitted to `rows`."""
+    def of(cls, model: Model, parts: DataSplit, rows: Bools, coherent: float) -> _Covariance:
+        """Covariance of a model that was fitted to `rows`; `coherent` errors add to its sum of squares."""
         unknowns = Unknowns.of(model, all_gains=True)
         hessian, _, slopes, residual = normal_equations(model, unknowns, rows)
         degrees_of_freedom = max(int(rows.sum()) - unknowns.count, 1)
@@ -188,10 +188,10 @@ class _Covariance:
         joint_unknowns = int((unknowns.index >= 0).any(axis=1).sum())
         factor = 1.0 + unknowns.count / degrees_of_freedom
         white, clustered = (factor * inverse @ inner @ inverse for inner in (white, sums.T @ sums))
-        coherent = np.asarray(_COHERENT_SHARE * (reading_error * rows.sum(axis=0)).sum() * inverse)
         quantile = stats.t.ppf(0.5 + CONFIDENCE_LEVEL / 2, max(cluster_count - joint_unknowns, 5))
         bias: Array = np.abs(_noise_bias(model, unknowns, rows, hessian, slopes))
-        return cls(unknowns.index, white, clustered, coherent, bias, float(quantile))
+        systematic: Array = np.asarray(coherent * inverse)
+        return cls(unknowns.index, white, clustered, systematic, bias, float(quantile))
 
     def half_widths(self, sums: Array) -> Array:
         """Half widths (S, J) of weighted sums (S, A) of the slots; slots that are not fitted are known."""
@@ -291,7 +291,7 @@ def _split_error(model: Model, rows: Bools, allowed: float) -> list[Array]:
     changes = [np.zeros(effect.values.shape) for effect in model.effects]
     if any(effect.candidate.confounded_with_delays for effect in model.effects):
         limit, total = squared_error(model, rows) + allowed, model.delays.sum(axis=0)
-        for change in _SPLIT_CHANGES_S:
+        for change in _OUTPUT_DELAY_CHANGES_S:
             output = np.clip(model.delays[1] + change, 0.0, np.minimum(total, MAX_DELAYS_S[1]))
             other = fit(model.with_delays(np.stack([total - output, output])), rows, delays=False)
             if squared_error(other, rows) < limit:

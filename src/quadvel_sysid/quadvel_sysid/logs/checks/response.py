@@ -401,11 +401,10 @@ def _is_bounded(log: Log, found: Response, j: int) -> bool:
     assert log.kp is not None
     row, lags = found.rows, found.lags[(found.lags >= 0.0) & (found.lags <= MAX_DRIVE_DELAY_S)]
     q, dq, tau = (np.asarray(x[row, j], dtype=float) for x in (log.q, log.dq, log.tau))
-    left = []
+    bounds, left = np.quantile(np.abs(tau), _BOUND_QUANTILES), []
     for lag in lags:
         k = log.command_rows(log.t[row] - lag + TIME_ROUNDING_S)
         asked = log.kp[k, j] * (log.q_des[k, j] - q) - (0.0 if log.kd is None else log.kd[k, j] * dq)
-        bounds = np.quantile(np.abs(tau), _BOUND_QUANTILES)
         left += [np.mean((tau - np.clip(asked, -bound, bound)) ** 2) for bound in bounds]
     return bool(min(left) < found.min_error_share[j] * np.var(tau))
 
