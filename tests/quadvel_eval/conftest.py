@@ -37,9 +37,6 @@ class StandingPolicy:
     def reset(self) -> None:
         """Do nothing: the policy has no state."""
 
-    def prepare(self) -> None:
-        """Do nothing: there is nothing to precompute."""
-
     def step(self, observation: np.ndarray) -> np.ndarray:
         return np.zeros(12, np.float32)
 

@@ -59,9 +59,6 @@ class StubPolicy:
         self.resets += 1
         self.seen = []
 
-    def prepare(self) -> None:
-        """Nothing to do ahead."""
-
     def step(self, observation: np.ndarray) -> np.ndarray:
         self.seen.append(observation.copy())
         if not np.isfinite(self.action).all():

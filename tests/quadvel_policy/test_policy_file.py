@@ -10,7 +10,6 @@ import numpy as np
 import onnx
 import pytest
 
-from quadvel_description.ahead import split_network
 from quadvel_description.network_file import NetworkFileError, read_network
 from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
@@ -50,28 +49,6 @@ def test_a_reset_clears_the_memory(write_policy: WritePolicy) -> None:
     first = [policy.step(o) for o in observations]
     policy.reset()
     np.testing.assert_array_equal([policy.step(o) for o in observations], first)
-
-
-@pytest.mark.parametrize("shipped", [True, False], ids=["shipped", "that can't be cut in two"])
-def test_a_prepared_policy_acts_as_one_that_is_not(write_policy: WritePolicy, shipped: bool) -> None:
-    path = SHIPPED_POLICY if shipped else write_policy()
-    plain, prepared = PolicyFile(ALIENGO, path), PolicyFile(ALIENGO, path)
-    observations = np.random.default_rng(3).normal(0.0, 0.3, (200, 48)).astype(np.float32)
-    for tick, observation in enumerate(observations):
-        if tick == 100:  # what was prepared belongs to the memory that is forgotten here
-            plain.reset()
-            prepared.reset()
-        np.testing.assert_allclose(prepared.step(observation), plain.step(observation), atol=2e-6)
-        if tick % 10:
-            prepared.prepare()
-
-
-def test_most_of_the_shipped_policy_needs_no_observation() -> None:
-    parts = split_network(read_network(SHIPPED_POLICY), "obs")
-    assert parts is not None
-    graphs = [part.one("graph") for part in parts]
-    ahead, rest = (sum(np.prod(one.all("dims")) for one in graph.all("initializer")) for graph in graphs)
-    assert ahead > rest
 
 
 def test_the_metadata_comes_with_the_file(write_policy: WritePolicy, metadata: PolicyMetadata) -> None:

@@ -182,20 +182,6 @@ def float_value(name: str, shape: Sequence[int]) -> Message:
     return message("ValueInfoProto", name=name, type=message("TypeProto", tensor_type=tensor))
 
 
-def stored_tensor(name: str, values: NDArray[np.float32]) -> Message:
-    """Create an initializer of float32.
-
-    Args:
-        name: Name of the initializer.
-        values: The numbers, of any shape.
-
-    Returns:
-        The "TensorProto".
-    """
-    data = values.astype("<f4").tobytes()
-    return message("TensorProto", dims=list(values.shape), data_type=FLOAT32, name=name, raw_data=data)
-
-
 def parse(content: bytes) -> Message:
     """Read an ONNX file.
 

@@ -1,7 +1,7 @@
 """ONNX network with LSTM memory and metadata, run step by step: policies and estimators.
 
 Inputs, outputs and metadata of the file must match what the caller expects. A step runs on one
-thread. A time-critical caller can compute a part of it before the observation arrives: `prepare`.
+thread.
 """
 
 from __future__ import annotations
@@ -9,17 +9,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from . import ahead
 from .network_file import NetworkFileError, read_network
 from .onnx_format import Message, serialise
 from .quadruped import JOINT_NAMES
@@ -34,7 +31,7 @@ MEMORY_OUTPUTS = ("h_out", "c_out")
 
 
 def open_session(path: Path, model: Message) -> onnxruntime.InferenceSession:
-    """Open a session of a network, or of a part of it, that runs on one thread.
+    """Open a session of a network that runs on one thread.
 
     Args:
         path: File of the network, for the error message.
@@ -126,7 +123,7 @@ class RecurrentNetwork:
         self._memories = [
             [np.zeros(self.metadata["state_shape"], np.float32) for _ in "hc"] for _ in range(2)
         ]
-        self._whole_runs = self._make_runs(self._session)
+        self._runs = [self._bind(*self._memories), self._bind(*self._memories[::-1])]
         self.reset()
 
     @property
@@ -136,18 +133,9 @@ class RecurrentNetwork:
 
     def reset(self) -> None:
         """Clear the memory."""
-        self._memory_index, self._next_runs = 0, self._whole_runs
+        self._memory_index = 0
         for memory in self._memories[0]:
             memory[:] = 0.0
-
-    def prepare(self) -> None:
-        """Compute the part of the next step that needs no observation; `step` is then faster.
-
-        Optional. The first call is slow: it splits the network.
-        """
-        if self._split_runs is not None:
-            ahead, self._next_runs = self._split_runs
-            ahead[self._memory_index]()
 
     def step(self, observation: NDArray[np.float32]) -> list[NDArray[np.float32]]:
         """Compute one time step.
@@ -162,8 +150,8 @@ class RecurrentNetwork:
             FloatingPointError: An output is not finite; the memory is invalid until `reset`.
         """
         self._input[0] = observation
-        self._next_runs[self._memory_index]()
-        self._memory_index, self._next_runs = 1 - self._memory_index, self._whole_runs
+        self._runs[self._memory_index]()
+        self._memory_index = 1 - self._memory_index
         result = self._result[0].copy()
         outputs = [result[place] for place in self._output_slices]
         if not all(map(math.isfinite, result.tolist())):  # faster than NumPy for so few numbers
@@ -172,37 +160,14 @@ class RecurrentNetwork:
             raise FloatingPointError(f"{self.path}: the network's output {broken} is not finite")
         return outputs
 
-    @cached_property
-    def _split_runs(self) -> tuple[list[_BoundRun], list[_BoundRun]] | None:
-        """Runs before and after the observation; None if the network cannot be split."""
-        models = ahead.split_network(self._model, "obs")
-        if models is None:
-            return None
-        before, after = (open_session(self.path, part) for part in models)
-        handed_over = {end.name: np.zeros(end.shape, np.float32) for end in before.get_outputs()}
-        return self._make_runs(before, handed_over), self._make_runs(after, handed_over)
-
-    def _make_runs(
-        self,
-        session: onnxruntime.InferenceSession,
-        handed_over: Mapping[str, NDArray[np.float32]] = MappingProxyType({}),
-    ) -> list[_BoundRun]:
-        """Return a run for each of the two alternating memories."""
-        return [
-            _BoundRun(
-                session,
-                {
-                    "obs": self._input,
-                    **dict(zip((*MEMORY_INPUTS, *MEMORY_OUTPUTS), (*read, *write), strict=True)),
-                    **{
-                        name: self._result[:, place]
-                        for name, place in zip(self._outputs, self._output_slices, strict=True)
-                    },
-                    **handed_over,
-                },
-            )
-            for read, write in (self._memories, self._memories[::-1])
-        ]
+    def _bind(self, read: Sequence[NDArray[np.float32]], write: Sequence[NDArray[np.float32]]) -> _BoundRun:
+        """Return a run from one of the alternating memories to the other."""
+        results = {
+            name: self._result[:, place]
+            for name, place in zip(self._outputs, self._output_slices, strict=True)
+        }
+        memories = dict(zip((*MEMORY_INPUTS, *MEMORY_OUTPUTS), (*read, *write), strict=True))
+        return _BoundRun(self._session, {"obs": self._input, **memories, **results})
 
     def mismatch_error(self, what: str, found: object, expected: object) -> NetworkFileError:
         """Return the error for a property of the file, for the caller to raise.

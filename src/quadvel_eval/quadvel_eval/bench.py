@@ -154,9 +154,9 @@ def bench_loop() -> dict[str, Any]:
 def bench_policy() -> dict[str, Any]:
     """Time the inference of the policy.
 
-    `p50_us` and `p99_us` measure the step after `prepare`, as in the controller. `whole` measures
-    both in one piece. `rested` measures the step after 5 ms of sleep, when other programs have
-    used the caches; `rested_idle` shows that cost for a network that does nothing.
+    `p50_us` and `p99_us` measure steps without a pause. `rested` measures the step after 5 ms of
+    sleep, when other programs have used the caches; `rested_idle` shows that cost for a network
+    that does nothing.
 
     Returns:
         Medians and a 99th percentile, us.
@@ -168,18 +168,14 @@ def bench_policy() -> dict[str, Any]:
     def step() -> None:
         network.step(observation)
 
-    def rest() -> None:
-        network.prepare()
-        time.sleep(CONTROL_PERIOD_S)
-
+    rest = partial(time.sleep, CONTROL_PERIOD_S)
     medians = {
-        "ahead_p50_us": _time_calls(network.prepare, 5000),
-        "whole_p50_us": _time_calls(step, 5000),
         "rested_p50_us": _time_calls(step, 400, rest),
         "rested_idle_p50_us": _time_calls(idle, 400, rest),
     }
-    prepared = _percentiles(_time_calls(step, 5000, network.prepare))
-    return prepared | {name: _percentiles(times)["p50_us"] for name, times in medians.items()}
+    return _percentiles(_time_calls(step, 5000)) | {
+        name: _percentiles(times)["p50_us"] for name, times in medians.items()
+    }
 
 
 def _idle_network() -> Callable[[], object]:
@@ -242,7 +238,7 @@ class _TimedSupervisor(Supervisor):
         start = time.perf_counter()
         answer = super().tick(inputs)
         self.seconds.append(time.perf_counter() - start)
-        self.prepare()
+        self.run_deferred()
         return answer
 
 
@@ -286,8 +282,6 @@ PARTS: dict[str, Benchmark] = {
         (
             ("p50_us", "inference, observation to action, median, us", "50 or less"),
             ("p99_us", "inference, observation to action, 99 %, us", ""),
-            ("ahead_p50_us", "inference, part done ahead, median, us", ""),
-            ("whole_p50_us", "inference, step in one piece, median, us", ""),
             ("rested_p50_us", "inference after 5 ms of rest, median, us", ""),
             ("rested_idle_p50_us", "smallest network after 5 ms of rest, us", ""),
         ),

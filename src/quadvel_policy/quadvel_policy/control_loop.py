@@ -292,7 +292,7 @@ class ControlLoop:
             compute = time.perf_counter() - start
             late = self._now() - self.stalled - state.time > PERIOD_S
             self.stats.add(start, compute, self.supervisor.inference_seconds, periods - 1 + late)
-            self.supervisor.prepare()
+            self.supervisor.run_deferred()
         elif self._sim_time:  # a simulator in lockstep waits for the answer to each of its states
             self._answer.tick = state.tick
             self._publish(self._answer)

@@ -66,8 +66,6 @@ class Controller(Node):
         robot = load_robot(self._settings.robot)
         self._robot_check = RobotCheck(self, robot)
         policy = chosen_policy(robot, self._settings.policy)
-        if policy:
-            policy.prepare()  # the first run is slow
         self._supervisor = Supervisor(
             robot, policy, self._settings.control.supervisor, KalmanEstimator(robot)
         )

@@ -38,9 +38,6 @@ class Policy(Protocol):
     def reset(self) -> None:
         """Reset the recurrent state."""
 
-    def prepare(self) -> None:
-        """Compute the part of the next step that needs no observation."""
-
     def step(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Run one step.
 
@@ -303,10 +300,6 @@ class Walk:
         self._observer.reset()
         self._previous_action = np.zeros(JOINTS, np.float32)
         self._held_ticks = self._ticks_per_step  # the next tick runs the network
-
-    def prepare(self) -> None:
-        """Compute the part of the next step that needs no observation."""
-        self._policy.prepare()
 
     def enter(self, inputs: ModeInput) -> None:
         """Reset the policy and keep the previous command for the fade-in.

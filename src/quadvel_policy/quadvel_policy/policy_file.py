@@ -125,10 +125,6 @@ class PolicyFile:
         """Reset the recurrent state."""
         self._network.reset()
 
-    def prepare(self) -> None:
-        """Compute the part of the next step that needs no observation; optional."""
-        self._network.prepare()
-
     def step(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Run one step.
 

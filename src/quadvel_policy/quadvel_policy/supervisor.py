@@ -226,7 +226,7 @@ class Supervisor:
             The joint command.
         """
         self.inference_seconds = float("nan")
-        self._run_deferred()
+        self.run_deferred()
         now, state = self._situation, inputs.state
         assert state is not None
         now.inputs = inputs
@@ -248,14 +248,11 @@ class Supervisor:
         self._previous_answer, self._deferred_input = answer, guard_input
         return answer
 
-    def prepare(self) -> None:
-        """Do work ahead of the next tick, so that its answer takes less time; optional."""
-        if self._walk and self.mode == "walk":
-            self._walk.prepare()
-        self._run_deferred()
+    def run_deferred(self) -> None:
+        """Run the deferred guards and the backup filter on the last tick, if they did not run yet.
 
-    def _run_deferred(self) -> None:
-        """Run the deferred guards and the backup filter on the last tick, after its answer."""
+        Call it after the answer left, so that the next tick takes less time; optional.
+        """
         if self._deferred_input is None:
             return
         self._guards.check_deferred(self._deferred_input)

@@ -58,9 +58,6 @@ class ImportedPolicy:
     def reset(self) -> None:
         """Do nothing: the network has no memory."""
 
-    def prepare(self) -> None:
-        """Do nothing: every part of the network needs the observation."""
-
     def step(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Run one step.
 
