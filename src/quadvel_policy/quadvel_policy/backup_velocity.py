@@ -21,8 +21,8 @@ REST_ACCELERATION = np.array([0.0, 0.0, GRAVITY])
 """Reading of an accelerometer at rest, world frame, m/s^2."""
 
 
-BATCH = 4
-"""States that wait for the filter while its velocity is not needed: 20 ms."""
+BATCH = 8
+"""States that wait for the filter while its velocity is not needed: 40 ms."""
 THINNING = 2
 """Of them the filter then processes every second one. In 11 walks of two robots, up to 3 m/s, its largest difference
 to the estimate changed by 0.011 m/s at most (decision 54).
@@ -57,7 +57,7 @@ class BackupVelocity:
     accelerometer.
 
     While its velocity only confirms the estimate, the filter processes every THINNING-th of BATCH
-    states at once, which costs a quarter. As soon as the velocity matters, it catches up, and
+    states at once, which costs less. As soon as the velocity matters, it catches up, and
     processes every state.
 
     Attributes:
