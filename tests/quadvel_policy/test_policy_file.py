@@ -10,9 +10,9 @@ import numpy as np
 import onnx
 import pytest
 
-from quadvel_description.network_file import NetworkFileError, read_network
+from quadvel_description.network_file import NetworkFileError
 from quadvel_policy.observation import PolicyMetadata
-from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from quadvel_policy.policy_file import PolicyFile
 from tests.helpers.robots import ALIENGO
 
 WritePolicy = Callable[..., Path]

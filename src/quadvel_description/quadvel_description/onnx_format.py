@@ -13,8 +13,6 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import attrs
-import numpy as np
-from numpy.typing import NDArray
 
 MAX_VALUES = 500_000
 """Largest number of values in a file. Most arrays of numbers count as one value."""
