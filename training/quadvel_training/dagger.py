@@ -87,6 +87,7 @@ class DaggerConfig:
         noise_time: s, time constant of the noise.
         timestep: s, of the physics.
         actuator: `eam`, `limited`, `rated`, `ideal`, or an actuator file.
+        others: other actuators, which an equal share of the robots has each.
         seed: seed of all draws.
         grid: commands; has to match the grid of the teacher, whose open cells are taken over.
         terrain: ground.
@@ -111,6 +112,7 @@ class DaggerConfig:
     noise_time: float = 0.05
     timestep: float = 0.0025
     actuator: str = "eam"
+    others: tuple[str, ...] = ()
     seed: int = 1
     grid: GridConfig = GridConfig()
     terrain: Terrain = Terrain()
@@ -175,6 +177,7 @@ class DaggerRun:
             seed=process_group.process_seed(c.seed),
             timestep=c.timestep,
             actuator=load_actuator(robot, c.actuator),
+            others=tuple(load_actuator(robot, name) for name in c.others),
             terrain=c.terrain,
             randomisation=c.randomisation,
         )

@@ -15,7 +15,6 @@ import numpy as np
 from mujoco.batch import Batch
 from scipy.spatial.transform import Rotation
 
-from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf
 from quadvel_description.command_range import split_target
@@ -27,7 +26,8 @@ from quadvel_policy.supervisor import MIN_STEPPING_SPEED
 from quadvel_sim.physics import Physics
 from quadvel_sim.terrain import Terrain
 
-from .randomisation import PlantSampler, Randomisation, sample_actuators
+from .actuator_groups import ActuatorGroups
+from .randomisation import PlantSampler, Randomisation
 from .similarity import Size
 
 TICK_S = 0.005  # one sample of the policy on the robot
@@ -178,6 +178,7 @@ class EnvConfig:
         kd: N m s/rad, derivative gain; the default is the robot's.
         episode: s, length of an episode.
         actuator: parameters of the actuators.
+        others: parameters of other actuators, which an equal share of the robots has each.
         randomisation: what varies.
         commands: range of commands, unless the environment is given another source.
         ramped: share of the commands that ramp to the new velocity, as the command mux does.
@@ -197,6 +198,7 @@ class EnvConfig:
     actuator: ActuatorParameters = attrs.field(
         default=attrs.Factory(lambda config: ActuatorParameters.of(config.robot), takes_self=True)
     )
+    others: tuple[ActuatorParameters, ...] = ()
     randomisation: Randomisation = Randomisation()
     commands: CommandRange = CommandRange()
     ramped: float = 0.3
@@ -278,7 +280,7 @@ class VelocityEnv:
         self.rng = np.random.default_rng(c.seed)
         self.batch = Batch(self.model, c.n, c.threads)
         self.plants = PlantSampler(self.batch, c.randomisation, self.rng)
-        self.actuators = ActuatorModel(c.actuator, (c.n, 12), c.timestep, seed=c.seed + 1)
+        self.actuators = ActuatorGroups((c.actuator, *c.others), c.n, c.timestep, seed=c.seed + 1)
         self._qpos, self._qvel, self._ctrl, self._clock = (
             self.batch.bind(name) for name in ("qpos", "qvel", "ctrl", "time")
         )
@@ -313,7 +315,7 @@ class VelocityEnv:
             return
         n, rng = len(ids), self.rng
         self.plants.sample(ids)
-        sample_actuators(self.actuators, ids, self.config.randomisation, rng)
+        self.actuators.sample(ids, self.config.randomisation, rng)
         self.batch.reset(ids.astype(np.int32), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         qpos, qvel = np.zeros((n, 19)), rng.normal(0, 0.1, (n, 18))
         heading = rng.uniform(-np.pi, np.pi, n)
