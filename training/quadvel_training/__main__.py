@@ -283,11 +283,16 @@ def close_the_loop(
     """Record a walk on a plant that training never saw, correct the model, tune the policy on it, and compare.
 
     Runs `record`, `quadvel identify`, `tune` and `quadvel paper --only gap`; existing files are kept.
+    The exit code is 1 if the tuned policy is refused: it is not better on that plant, or worse on the
+    actuators that the policy knew.
     """
     try:
-        _written(closing.close_the_loop(plant, policy, checkpoint, teacher, minutes, out))
+        reason = closing.close_the_loop(plant, policy, checkpoint, teacher, minutes, out)
     except subprocess.CalledProcessError as error:
         raise typer.Exit(error.returncode) from None
+    if reason:
+        print(f"refused: {out}/tuned/policy.onnx: {reason}")
+        raise typer.Exit(1)
 
 
 @app.command("estimator")

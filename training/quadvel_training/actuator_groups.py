@@ -82,9 +82,14 @@ class ActuatorGroups:
             Torques, (n, 12), N m; the next call overwrites them.
         """
         for rows, model in self._groups:
-            own = [a[rows] if np.ndim(a) == 2 else a for a in (q, dq, q_des, kp, kd, dq_des, tau_ff)]
-            self._torque[rows] = model.step(*own)
+            gains_and_more = (_rows(value, rows) for value in (kp, kd, dq_des, tau_ff))
+            self._torque[rows] = model.step(q[rows], dq[rows], q_des[rows], *gains_and_more)
         return self._torque
+
+
+def _rows(value: Values, rows: slice) -> Values:
+    """Rows of an array (n, 12); a number stays."""
+    return np.asarray(value)[rows] if np.ndim(value) == 2 else value
 
 
 def _within(rows: slice, ids: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Closed loop on a plant that training never saw, as a sequence of commands.
 
 A walk is recorded, the model corrected from it, the policy tuned on that model, and both policies
-compared on the same plants.
+compared on the same plants. A tuned policy that is not better is refused.
 """
 
 from __future__ import annotations
@@ -9,7 +9,15 @@ from __future__ import annotations
 import shlex
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+
+import attrs
+import numpy as np
+
+from quadvel_eval.paper.files import read_records
+from quadvel_eval.paper.gap import TRAINED, paired_errors
+from quadvel_eval.paper.section import Record, select
 
 from .env import available_cores
 
@@ -26,6 +34,74 @@ STEPS = (  # file that a step writes, and arguments of python
         "-m quadvel_bringup paper --only gap --out {out}/gap --policy before={policy} --policy after={out}/tuned/policy.onnx",
     ),
 )
+
+
+@attrs.frozen
+class Comparison:
+    """Both policies on the same walks of one plant.
+
+    Attributes:
+        plant: plant of the gap.
+        before: m/s, mean velocity error of the policy, on walks that neither fell on.
+        after: m/s, the same of the tuned policy.
+        uncertainty: m/s, two standard errors of the mean difference of the walks.
+        more_falls: falls of the tuned policy, minus those of the policy.
+    """
+
+    plant: str
+    before: float
+    after: float
+    uncertainty: float
+    more_falls: int
+
+    @classmethod
+    def of(cls, records: Sequence[Record], plant: str) -> Comparison:
+        """Compare the policies `before` and `after`.
+
+        Args:
+            records: records of the section `gap`.
+            plant: plant of the gap.
+
+        Returns:
+            The comparison; NaN where no command was walked by both.
+        """
+        mine = select(records, level=plant)
+        falls = {name: sum(r["fell"] for r in select(mine, policy=name)) for name in ("before", "after")}
+        before, after = paired_errors(mine, "before", "after")
+        spread = np.std(after - before, ddof=1) if len(before) > 1 else np.nan
+        return cls(
+            plant,
+            float(np.mean(before)) if len(before) else np.nan,
+            float(np.mean(after)) if len(after) else np.nan,
+            2.0 * float(spread) / max(len(before), 1) ** 0.5,
+            falls["after"] - falls["before"],
+        )
+
+    def __str__(self) -> str:
+        """Return plant, errors and falls as a line."""
+        falls = f", {self.more_falls:+d} falls" if self.more_falls else ""
+        share = 100.0 * (self.after / self.before - 1.0)
+        return (
+            f"{self.plant}: mean error {self.before:.4f}, tuned {self.after:.4f} m/s "
+            f"({share:+.0f} %; difference known to {self.uncertainty:.4f} m/s){falls}"
+        )
+
+
+def refusal(on_plant: Comparison, as_trained: Comparison) -> str:
+    """Return why a tuned policy should not replace the one before.
+
+    Args:
+        on_plant: comparison on the plant that it was tuned for.
+        as_trained: comparison on the plant of the robot's own actuator model.
+
+    Returns:
+        One sentence; "" if it is better on the plant and no worse as trained.
+    """
+    if on_plant.more_falls > 0 or not on_plant.after < on_plant.before - on_plant.uncertainty:
+        return f"it is not better on the plant that it was tuned for ({on_plant})"
+    if as_trained.more_falls > 0 or not as_trained.after <= as_trained.before + as_trained.uncertainty:
+        return f"it is worse on the actuators that the policy knew ({as_trained})"
+    return ""
 
 
 def fill_steps(
@@ -55,8 +131,11 @@ def fill_steps(
 
 def close_the_loop(
     plant: str, policy: Path, checkpoint: Path, teacher: Path, minutes: float, out: Path
-) -> Path:
+) -> str:
     """Run the steps whose files are missing; each command is printed before it runs.
+
+    At the end the errors of both policies are printed, on the plant and on that of the robot's own
+    actuator model.
 
     Args:
         plant: plant of the gap.
@@ -67,7 +146,7 @@ def close_the_loop(
         out: folder of the results.
 
     Returns:
-        The page with the errors of both policies.
+        Why the tuned policy is refused, one sentence; "" if it is better.
 
     Raises:
         subprocess.CalledProcessError: a command failed.
@@ -79,4 +158,7 @@ def close_the_loop(
         else:
             print("$ python", shlex.join(arguments), flush=True)
             subprocess.run([sys.executable, *arguments], check=True)
-    return all_of_them[-1][0]
+    records = read_records(all_of_them[-1][0].with_name("gap.csv"))
+    compared = [Comparison.of(records, name) for name in (plant, TRAINED)]
+    print(*compared, f"written: {out}", sep="\n")
+    return refusal(*compared)

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from quadvel_actuator import ActuatorParameters, Effect
+from quadvel_description.arrays import Array
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot, load_robot
 from quadvel_recordings.output import atomic_write
@@ -22,9 +23,11 @@ from quadvel_recordings.output import atomic_write
 from .cells import Command, cell_record, command_limits, count_falls, largest_error, mean_error
 from .conditions import Condition, condition_job, draw_error_and_survival
 from .identification import record_mixed_walk
-from .section import Job, JobResults, Record, Row, Section, Study, by_policy, distinct, mean, select
+from .section import Job, JobResults, Record, Row, Section, Study, by_policy, distinct, select
 
 LAG_S = 0.005  # s
+TRAINED = "as in training"
+"""Level of the plant with the robot's own actuator model."""
 COMMANDS: tuple[Command, ...] = (
     (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 1.0),
     (0.0, 0.0, -1.0), (1.0, 0.4, 0.0), (1.0, -0.4, 0.0), (0.8, 0.0, 0.8), (0.8, 0.0, -0.8),
@@ -60,7 +63,7 @@ def drive_conditions(robot: Robot) -> list[Condition]:
     """
     other = "aliengo" if robot.name == "go2" else "go2"
     drives = {
-        "as in training": ActuatorParameters.of(robot),
+        TRAINED: ActuatorParameters.of(robot),
         "friction": _default_with_effect(robot, "stribeck_friction", c=1.2, c_s=1.8, v_s=0.3, v_0=0.05),
         "torque-speed limit": _default_with_effect(robot, "torque_speed_limit", stall=24.0, no_load=12.0),
         "lag": _default_with_effect(robot, "first_order_lag", T=LAG_S),
@@ -95,6 +98,28 @@ def write_walk_log(robot: Robot, policy: Path, plant: str, out: Path, seed: int 
         np.savez_compressed(draft, joint_names=np.array(log.joints), **fields)
 
 
+def paired_errors(records: Sequence[Record], one: str, other: str) -> tuple[Array, Array]:
+    """Return the errors of two policies on the same walks, of those that neither fell on.
+
+    Args:
+        records: Records of `cell_record`.
+        one: A policy.
+        other: Another policy.
+
+    Returns:
+        Errors of both, (n,) each, m/s.
+    """
+
+    def errors(name: str) -> dict[tuple[Any, ...], float]:
+        mine = select(records, policy=name, fell=0)
+        return {tuple(r[key] for key in ("level", "vx", "vy", "wz", "seed")): r["error_xy"] for r in mine}
+
+    both = errors(one), errors(other)
+    walks = both[0].keys() & both[1].keys()
+    first, second = (np.array([by_walk[walk] for walk in sorted(walks)]) for by_walk in both)
+    return first, second
+
+
 def error_reduction(records: Sequence[Record], policy: str) -> dict[str, float | None]:
     """Return how much lower the mean error of each other policy is, on walks without a fall.
 
@@ -105,19 +130,11 @@ def error_reduction(records: Sequence[Record], policy: str) -> dict[str, float |
     Returns:
         Reduction relative to the reference, %, by policy.
     """
-
-    def errors(name: str) -> dict[tuple[Any, ...], Record]:
-        mine = select(records, policy=name, fell=0)
-        return {tuple(r[key] for key in ("level", "vx", "vy", "wz", "seed")): r for r in mine}
-
-    before = errors(policy)
     found: dict[str, float | None] = {}
     for other in distinct(records, "policy"):
-        after = errors(other)
-        both = before.keys() & after.keys()
-        if other != policy and both:
-            was, is_now = (mean([walks[key] for key in both], "error_xy") for walks in (before, after))
-            found[other] = 100.0 * (1.0 - is_now / was)
+        before, after = paired_errors(records, policy, other)
+        if other != policy and len(before):
+            found[other] = 100.0 * (1.0 - float(after.mean() / before.mean()))
     return found
 
 
