@@ -32,7 +32,7 @@ class TuningConfig:
 
     Attributes:
         robot: name of a shipped robot, or path of a robot.yaml.
-        n: number of robots.
+        n: number of robots, on both grounds together.
         window: s, length of a window; each one is filtered separately.
         windows: number of windows per robot.
         evaluations: evaluations of the search.
@@ -55,13 +55,14 @@ class TuningConfig:
 
 @attrs.frozen
 class WalkRecording:
-    """Windows of T ticks of R robots, the first half of them on flat ground.
+    """R windows of T ticks, the first half of them on flat ground.
 
     Attributes:
         robot: the robot.
         states: T readings, each of arrays (R, ...).
         truth: (T, R, 3), m/s, true velocity in the body frame.
-        is_scored: (T, R) bool, ticks that count: the robot is up and the filter has settled.
+        is_scored: (T, R) bool, ticks that count: the robot has neither fallen nor timed out in this window,
+            and the filter has settled.
     """
 
     robot: Robot
@@ -71,7 +72,7 @@ class WalkRecording:
 
 
 def record(config: TuningConfig, actor: Recurrent) -> WalkRecording:
-    """Record walks of a policy that gets the true velocity.
+    """Record walks of a policy that gets the true velocity with the noise of its training.
 
     Args:
         config: configuration.
@@ -145,7 +146,7 @@ def rmse(config: KalmanConfig, recording: WalkRecording) -> np.ndarray:
 def tune(
     recording: WalkRecording, evaluations: int, progress: Callable[[np.ndarray], None] = lambda error: None
 ) -> KalmanConfig:
-    """Minimise the mean of `rmse` from the present configuration by Nelder and Mead's search.
+    """Minimise the mean of `rmse` from the defaults of `KalmanConfig` by Nelder and Mead's search.
 
     Args:
         recording: recorded walks.

@@ -1,4 +1,7 @@
-"""The teacher as stage 2 evaluates it: at every tick, with averaged actions, for labels without jumps."""
+"""Runs the teacher of stage 1 at every tick (200 Hz) for stage 2, where it drives robots and labels actions.
+
+Shapes: n robots; T ticks of N robots in sequences.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from .past import Past
 from .privileged import ACTION_BOUND
 from .walking_rewards import SAMPLE_S
 
-HOLD_TICKS = round(SAMPLE_S / TICK_S)  # the teacher learned with actions held for so long
+HOLD_TICKS = round(SAMPLE_S / TICK_S)  # for which the teacher's actions were held when it learned
 RECALLED_MIRROR = symmetry.concatenate_mirrors(
     [
         privileged.PLANAR,  # error over a stride
@@ -29,9 +32,9 @@ RECALLED_MIRROR = symmetry.concatenate_mirrors(
 )
 RECALLED_SIZE = len(RECALLED_MIRROR.index)
 AVERAGED_TICKS = 3
-"""Ticks over which a teacher that drives averages its actions: held actions act late by as much"""
+"""Ticks over which a teacher that drives averages its actions; this delays them as much as holding them did."""
 LABEL_BEFORE, LABEL_AFTER = 3, 1
-"""Ticks before and after its own that a label averages: as late as `AVERAGED_TICKS`, and without jumps"""
+"""Ticks before and after its own over which a label is averaged; the mean delay is one tick, as above."""
 
 
 class Teacher:
@@ -45,7 +48,7 @@ class Teacher:
         actor: policy of the teacher.
         env: environments.
         past: past of the robots.
-        latest: (n, 12), last action before the average, in the network's unit.
+        latest: (n, 12), last action before the average, in units of `privileged.ACTION_SCALE` (rad).
     """
 
     def __init__(self, checkpoint: dict[str, Any], env: VelocityEnv) -> None:
@@ -78,7 +81,7 @@ class Teacher:
         """Evaluate the teacher; call it once per tick.
 
         Returns:
-            (n, 12), action in the network's unit.
+            (n, 12), action, in units of `privileged.ACTION_SCALE` (rad).
         """
         obs = privileged.observe(self.env, self.past, self._executed[0])
         with torch.no_grad():
@@ -94,8 +97,8 @@ class Teacher:
         """Record a tick.
 
         Args:
-            command: (n, 4), command that was in force.
-            executed: (n, 12), actions taken, in the network's unit.
+            command: (n, 4), command that was in force: vx, vy (m/s), yaw rate (rad/s), 1 to stand.
+            executed: (n, 12), actions taken, in units of `privileged.ACTION_SCALE` (rad).
         """
         self.past.advance(command)
         self._executed.append(executed.clip(-ACTION_BOUND, ACTION_BOUND))
@@ -104,8 +107,9 @@ class Teacher:
         """Return what the teacher observes of past and ground, which a memory has to keep or to infer.
 
         Returns:
-            (n, RECALLED_SIZE), scaled to about 1: errors over a stride and lasting ones, lag, plan, slope
-            of the ground.
+            (n, RECALLED_SIZE), scaled to about 1: errors over a stride (3) and lasting ones (3), lag behind
+            the plan (3), sine and cosine of the phase of the steps (2), planned velocity (3), slope of
+            the ground (2).
         """
         past, slope = self.past, self.env.ground_slope
         return np.concatenate(
@@ -117,15 +121,15 @@ def smooth_labels(actions: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Average the teacher's actions around each tick.
 
     The teacher's targets jump where it plans a touchdown or a lift-off, and its student would copy the
-    jumps. It sees them come, so actions after a tick count as well: the mean is no later than the
-    causal one with which the teacher drives.
+    jumps. It knows them in advance, so that later actions may count as well; the mean delay is that of
+    the average with which the teacher drives.
 
     Args:
         actions: (T, N, 12), actions of the teacher.
         mask: (T, N), 1 for robots that are up; actions of others do not count.
 
     Returns:
-        (T, N, 12), means over `LABEL_BEFORE` ticks before to `LABEL_AFTER` after, as far as there are.
+        (T, N, 12), means over `LABEL_BEFORE` ticks before to `LABEL_AFTER` after, fewer at the ends of the sequence.
     """
     ticks = np.arange(len(actions))
     first, last = np.maximum(ticks - LABEL_BEFORE, 0), np.minimum(ticks + LABEL_AFTER, len(actions) - 1)

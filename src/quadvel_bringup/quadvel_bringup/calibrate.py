@@ -59,7 +59,7 @@ def calibrate_command(
         str | None,
         typer.Option(
             metavar="<name|file>",
-            help="The robot: aliengo, go2 or the folder of a robot. Default: that of the recording.",
+            help="The robot: aliengo, go2, or a robot.yaml or its folder. Default: that of the recording.",
         ),
     ] = None,
     out: Annotated[Path, typer.Option(metavar="<file>", help="The file to write.")] = Path(

@@ -18,8 +18,8 @@ def up(stack: Stack, view: bool = False) -> int:
     """Run the processes of a robot until Ctrl-C or until one of its nodes ends.
 
     After Ctrl-C the exit code is 0 if every node ended with 0. A node that ends by itself is a
-    fault: the others are stopped, and its exit code is returned, or 1 if that was 0. Only the end
-    of the page does not stop the robot. Errors pass through: ValueError or OSError for a wrong
+    fault: the others are stopped, and its exit code is returned, or 1 if that was 0. The page is the
+    exception: if it ends, the robot goes on (`PageWatch`). Errors pass through: ValueError or OSError for a wrong
     parameter or file, RobotAlreadyRunningError for a second robot.
 
     Args:
@@ -54,7 +54,7 @@ def up(stack: Stack, view: bool = False) -> int:
 
 
 def check_exclusive() -> None:
-    """Run `ensure_exclusive` with a temporary node."""
+    """Raise RobotAlreadyRunningError if another robot or simulator publishes in this ROS domain."""
     quadvel_dds.install()
     from .session import Session
 

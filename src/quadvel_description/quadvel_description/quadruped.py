@@ -1,4 +1,8 @@
-"""What all robots here share: names and order of legs and joints, signs of their places, gravity."""
+"""What all robots here share: names and order of legs and joints, the side of each leg, gravity.
+
+FR is the front right leg, FL front left, RR rear right, RL rear left. Robot files, messages,
+recordings and shipped networks have the same names in the same order: a change here breaks them.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +11,8 @@ from collections.abc import Sequence
 LEGS = ("FR", "FL", "RR", "RL")
 KINDS = ("hip", "thigh", "calf")
 JOINT_NAMES = tuple(f"{leg}_{kind}_joint" for leg in LEGS for kind in KINDS)
-FRONT = {"FR": 1, "FL": 1, "RR": -1, "RL": -1}  # sign of x
-LEFT = {"FR": -1, "FL": 1, "RR": -1, "RL": 1}  # sign of y
+FRONT = {"FR": 1, "FL": 1, "RR": -1, "RL": -1}  # sign of x, which points forward
+LEFT = {"FR": -1, "FL": 1, "RR": -1, "RL": 1}  # sign of y, which points to the left
 
 GRAVITY = 9.81  # m/s^2
 

@@ -37,7 +37,9 @@ ClusterOption = Annotated[
 
 RobotOption = Annotated[
     str,
-    typer.Option("--robot", metavar="<name|file>", help="The robot: aliengo, go2 or the folder of a robot."),
+    typer.Option(
+        "--robot", metavar="<name|file>", help="The robot: aliengo, go2, or a robot.yaml or its folder."
+    ),
 ]
 
 
@@ -63,7 +65,9 @@ def eval_command(
     terrain: Annotated[Literal["flat", "rough", "slope"], typer.Option(help="Terrain.")] = "flat",
     actuator: Annotated[
         Path | None,
-        typer.Option(metavar="<file>", help="The robot's actuator.yaml.", show_default="the shipped one"),
+        typer.Option(
+            metavar="<file>", help="Actuator model of the simulated robot.", show_default="the shipped one"
+        ),
     ] = None,
     randomised: Annotated[
         bool,
@@ -93,8 +97,8 @@ def eval_command(
     commands = [cell.command for cell in grid_cells(grid, 1)]
     if beyond := sum(not is_within_limits(command, limits) for command in commands):
         console.print(
-            f"{beyond} of {len(commands)} commands exceed the policy's limits, which cut them: "
-            "their error counts what was cut"
+            f"{beyond} of {len(commands)} commands exceed the policy's limits. The policy gets them clipped; "
+            "errors are those against the commands before."
         )
     with walk_progress_bar() as bar:
         task = bar.add_task("walks", total=None)

@@ -45,7 +45,7 @@ class Cell:
 
     Attributes:
         command: Commanded vx, vy (m/s) and wz (rad/s), body frame.
-        seed: Seed of sensor noise, terrain and drawn plants.
+        seed: Seed of sensor noise, terrain and randomised plants.
     """
 
     command: tuple[float, float, float]
@@ -54,13 +54,13 @@ class Cell:
 
 @attrs.frozen
 class CellResult:
-    """Figures of one run; a robot that fell has only its cell.
+    """Figures of one run; only `cell` is set if the robot fell.
 
     Attributes:
         cell: The run.
         segment: Command and mean velocity after the settling time; None if the robot fell.
-        jitter: Mean absolute second difference of the joint targets, rad.
-        cot: Cost of transport or of turning (Eq. 10), without unit; None if the robot does not
+        jitter: Mean absolute second difference of the joint targets of three ticks (5 ms each), rad.
+        cot: Cost of transport or of turning (Eq. 10 of the paper), without unit; None if the robot does not
             follow.
         estimator_mse: Mean square error of each estimator over the whole walk, (3,), (m/s)^2.
         estimator_drift: Final dead reckoning error of each estimator, m.

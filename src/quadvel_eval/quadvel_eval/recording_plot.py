@@ -376,7 +376,7 @@ RobotOption = Annotated[
     str | None,
     typer.Option(
         metavar="<name|file>",
-        help="The robot: aliengo, go2 or the folder of a robot.",
+        help="The robot: aliengo, go2, or a robot.yaml or its folder.",
         show_default="as recorded, or aliengo",
     ),
 ]

@@ -15,11 +15,11 @@ from quadvel_description.arrays import Array, Bools, Indices
 MIN_RANGE_M = 0.02
 """A smaller range means that there was no echo."""
 MIN_GAP_M = 0.13
-"""Smallest distance between two clusters."""
+"""Neighbouring readings farther apart than this belong to different clusters."""
 MIN_GAP_SPACINGS = 1.6
-"""The same in ray spacings; the larger of both counts."""
+"""The same as a multiple of the distance of neighbouring rays; the larger limit applies."""
 MAX_LOST_RAYS = 3
-"""Number of rays without an echo that do not split a cluster."""
+"""Largest number of rays without an echo inside a cluster."""
 WINDOW_OFFSETS_M = np.linspace(-0.6, 0.6, 49)
 """Lateral positions of the classifier's window."""
 WINDOW_DEPTH_M = 0.5
@@ -27,7 +27,7 @@ WINDOW_DEPTH_M = 0.5
 LEG_WIDTH_M = 0.12
 """Typical width of a leg; scales widths and spacings."""
 MAX_CLUSTER_WIDTH_M = 0.5
-"""Width of two legs next to each other."""
+"""Widest cluster that `leg_detector` classifies: two legs side by side."""
 FEATURE_COUNT = WINDOW_OFFSETS_M.size + 4
 
 

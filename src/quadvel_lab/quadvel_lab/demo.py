@@ -51,7 +51,8 @@ def demo_command(
         typer.Argument(help="A walk in all directions, or following a person through a world."),
     ] = "walk",
     robot: Annotated[
-        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or the folder of a robot.")
+        str,
+        typer.Option(metavar="<name|file>", help="The robot: aliengo, go2, or a robot.yaml or its folder."),
     ] = DEFAULT_ROBOT,
     out: Annotated[
         Path | None,

@@ -177,7 +177,8 @@ def excite_command(
         typer.Option(help="What serves low_state and low_cmd; external: a running robot."),
     ] = "sim",
     robot: Annotated[
-        str, typer.Option(metavar="<name|file>", help="The robot: aliengo, go2 or the folder of a robot.")
+        str,
+        typer.Option(metavar="<name|file>", help="The robot: aliengo, go2, or a robot.yaml or its folder."),
     ] = DEFAULT_ROBOT,
     suspended: Annotated[
         bool | None,

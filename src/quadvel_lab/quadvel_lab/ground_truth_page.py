@@ -27,8 +27,8 @@ class Row:
     Attributes:
         name: Its name.
         unit: Its unit.
-        error: Error of the "before" or "after" part of an entry.
-        noise: Error due to noise alone, if known, of an entry.
+        error: Function from the "before" or "after" part of an entry to its error.
+        noise: Function from an entry to the error that noise alone causes, or None.
     """
 
     name: str

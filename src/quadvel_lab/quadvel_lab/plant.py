@@ -32,7 +32,7 @@ class HiddenPhysics(Protocol):
     """An effect on the torque of a drive.
 
     Attributes:
-        memory: Its complete state.
+        memory: Its complete state; `torque` replaces the array and never changes it in place.
     """
 
     memory: Array
@@ -41,7 +41,7 @@ class HiddenPhysics(Protocol):
         """Compute the joint torque.
 
         Args:
-            asked: Torque of the modelled drive, (12,) N m.
+            asked: Torque that the stack's own model predicts, (12,) N m.
             q: (12,) rad.
             dq: (12,) rad/s.
             dt: Time step, s.
@@ -111,10 +111,10 @@ class SlowCurrent(HiddenPhysics):
 
 @attrs.define(kw_only=True)
 class ChafingCable(HiddenPhysics):
-    """Friction and a constant pull of a cable that chafes in a part of a joint's range.
+    """Friction of a cable that chafes in a part of a joint's range, and its constant pull.
 
     Attributes:
-        rub: Friction, (12,) N m.
+        rub: Friction, (12,) N m; the pull is 0.4 times as large.
         begin: Angle where the contact starts, towards larger angles, (12,) rad.
         width: Range over which the contact builds up, rad.
         memory: Empty; the effect has no state.
@@ -192,6 +192,7 @@ class HiddenDrives(ActuatorModel):
         Returns:
             Torque (12,) N m.
         """
+        # The base class calls `step`, which changes the memory and draws noise.
         memory, draw, draws = self._physics.memory, self._next_draw, self._draws.bit_generator.state
         torque = super().peek(q, dq, *arguments, **named)
         self._physics.memory, self._next_draw, self._draws.bit_generator.state = memory, draw, draws
@@ -210,7 +211,7 @@ class Plant(Simulator):
     Args:
         config: Configuration of the simulator.
         physics: Makes the hidden effect.
-        log: Receives the state every ms: robot boards log joints faster than they report them.
+        log: Is called with the state every ms, as a robot's board logs; the stack gets 200 Hz only.
     """
 
     def __init__(

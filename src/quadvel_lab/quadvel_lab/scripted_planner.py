@@ -34,7 +34,9 @@ class PlannerParameters:
     """
 
     script: str = field("full", f"which script is walked: {' or '.join(SCRIPTS)}", one_of=SCRIPTS)
-    wait: bool = field(False, "whether the script waits for the service ~/start, as a recorder calls it")
+    wait: bool = field(
+        False, "whether the script waits for the service ~/start, which a recorder calls when it is ready"
+    )
 
 
 class ScriptedPlanner(Node):
@@ -62,7 +64,7 @@ class ScriptedPlanner(Node):
         return response
 
     def _on_state(self, message: Any) -> None:
-        """Store the mode. The first report with a rate counts: before it the controller refuses requests."""
+        """Store the mode; reports before the first one with a rate do not count, as requests are refused then."""
         if self._mode or message.rate_hz:
             self._mode, self._reason = message.mode_name, message.reason
             self._walk_refusal = message.walk_refusal
@@ -91,8 +93,8 @@ class ScriptedPlanner(Node):
     def _request_mode(self, mode: str) -> None:
         """Request a mode, unless an earlier request is on its way or its answer is not visible yet.
 
-        The controller's state shows the answer, and the script repeats its request until then. The
-        controller serves each request: one too many arrives in the next mode, and is refused there.
+        The controller's state shows the answer, and the script repeats its request until then. A request
+        that is repeated too early would arrive after the mode has changed, and be refused.
         """
         if time.monotonic() < self._next_request or not self._set_mode.service_is_ready():
             return

@@ -1,7 +1,7 @@
-"""Detection of stalls of this process, to distinguish them from a silent robot. Takes no time itself.
+"""Detection of stalls of this process, to distinguish them from a silent robot.
 
-After a stall of the machine, the newest known message is old, while newer ones wait to be read, or
-their sender has stalled, too. A process detects its own stall by a timer that fires late.
+It reads no clock: the caller passes the time. After a stall the last message seems too old, although
+newer ones wait to be read, or their sender stalled, too. A process detects its own stall by a timer that fires late.
 """
 
 from __future__ import annotations
@@ -10,11 +10,13 @@ import math
 
 
 class StallDetector:
-    """Detects that this process did not run, and excuses silence for one period after that, once.
+    """Detects that this process did not run, and excuses silence for one period after that.
+
+    Further stalls do not prolong the excuse until a message arrives.
 
     Attributes:
         count: Number of stalls since the start.
-        stalled_s: Duration of stalls since the last message, s.
+        stalled_s: Sum of the intervals between calls of `poll` that held a stall, since the last message, s.
     """
 
     def __init__(self, period: float, tolerance: float) -> None:
@@ -29,7 +31,7 @@ class StallDetector:
         self._period = period
         self._tolerance = tolerance
         self._last_poll: float | None = None
-        self._excused_until: float | None = None  # None: no pause since the last message
+        self._excused_until: float | None = None  # None: no stall since the last message
 
     def poll(self, now: float) -> None:
         """Record that this process runs.

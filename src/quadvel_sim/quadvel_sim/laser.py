@@ -13,8 +13,8 @@ from quadvel_description.arrays import Array
 from quadvel_description.fields import field
 
 LASER_VISIBLE_GROUP = 2
-"""MuJoCo group of the geoms that a laser sees; links of the robot and low patches are in others."""
-_MIN_EDGE_M = 0.1  # step between neighbouring ranges from which a beam may hit two objects
+"""MuJoCo group of the geoms that a laser sees; links of the robot and patches of ground are in others."""
+_MIN_EDGE_M = 0.1  # smallest difference of neighbouring ranges at which a beam may hit two objects
 _RAY_LENGTH_FACTOR = 1.5  # length of a cast ray by range_max; finds the background of an edge
 _INCLUDE_STATIC = 1  # flg_static of mj_multiRay: geoms of the world body count
 

@@ -1,6 +1,7 @@
-"""Parts of a world: walls, boxes, trees, tables, patches, hills, people. Each adds its own geoms.
+"""Parts of a world: walls, boxes, trees, tables, patches, hills, people.
 
-`world` reads the list of parts from a file, and `persons` moves the people. Positions are in the
+`world` reads the list of parts from a file. Each part adds its own geoms; `persons` adds and moves
+the people. Positions are in the
 world frame, m; yaw in a file is in degrees.
 """
 
@@ -66,7 +67,7 @@ class Surface:
     Attributes:
         friction: Sliding friction coefficient of a foot on it.
         bumps: Height of its bumps, m.
-        wavelength: Distance of its bumps, m.
+        wavelength: Distance between its bumps, m.
     """
 
     friction: float
@@ -263,9 +264,9 @@ class Patch:
         )
 
     @property
-    def point_count(self) -> float:
+    def point_count(self) -> int:
         """Number of points of the height field."""
-        return float(np.prod(self.size / _PATCH_SPACING_M + 1.0))
+        return int(np.prod(self.size / _PATCH_SPACING_M + 1.0))
 
     def _heights(self, seed: int) -> Array:
         """Return heights that grow from the rim to the bumps, m; rows across, columns along."""
@@ -286,11 +287,11 @@ class Hill:
     """Rectangular mound with a level top and slopes on all four sides.
 
     Raises:
-        ValueError: A value is out of its range, or opposite slopes meet below `height`.
+        ValueError: A value is out of its range, or the slopes meet before they reach `height`.
 
     Attributes:
         position: Centre, (2,), m.
-        size: Length and width of the foot, (2,), m.
+        size: Length and width at its base, (2,), m.
         height: Height of the level top, m.
         slope: Inclination of the slopes along its length, deg.
         sides: Inclination of the slopes across it, deg; None: the same as `slope`.

@@ -1,9 +1,11 @@
 """Basis regressors: generic curves of named signals, for deviations that no effect of the registry explains.
 
-A regressor is a weighted sum of basis functions of one signal (`shapes`). It may be multiplied by
-the direction of motion, the speed or the torque. Its torque is bounded by what it was on the
-training rows. Like effects, regressors run over whole series and step by step. Parameter files name
-them `terms`.
+A regressor is a weighted sum of basis functions of one signal (`shapes` has the kinds). It may be
+multiplied by the direction of motion, the speed or the torque (`MULTIPLIERS`). Its torque is clipped
+to the largest value that it had on the fitted rows. Like effects, regressors run over whole series
+and step by step. In a parameter file all regressors form one effect, `learned_residual`, whose
+parameter `terms` lists them. `quadvel_sysid.search.regressor_library` lists which signals,
+multipliers and shapes the identification tries.
 
 Signals have the names of the report: `q`, `dq`, `ddq`, `q_des`, `error` (q_des - q), `t`, `tau`
 (prediction without regressors), and `FR_thigh_joint/q` for those of another joint.
@@ -24,13 +26,13 @@ from .numerics import smooth_sign
 from .shapes import Shape
 
 LEARNED_RESIDUAL = "learned_residual"
-"""Name of regressors in reports and parameter files"""
+"""Name of the effect that all regressors form in reports and parameter files."""
 
 SIGNALS = ("q", "dq", "ddq", "q_des", "tau", "error", "t")
 MULTIPLIERS = ("", "direction", "dq", "tau")
 
 _DIRECTION_WIDTH_RAD_S = np.array(0.05)
-"""Velocity, rad/s, at which the smooth direction of motion is 0.76"""
+"""Width w, rad/s, of the smooth direction of motion tanh(dq / w)."""
 
 
 def read_signal(name: str, view: View, tau: Array, joints: Sequence[str]) -> Array:
@@ -135,7 +137,7 @@ class BasisRegressor:
 
     @property
     def is_per_joint(self) -> bool:
-        """Whether each joint has its own column of the signal."""
+        """Whether each joint reads its own signal, not one that all share (`t`, or another joint's)."""
         return "/" not in self.signal and self.signal != "t"
 
     def to_entry(self, joints: Sequence[str]) -> dict[str, Any]:
@@ -170,7 +172,7 @@ class RunningRegressors:
     """
 
     def __init__(self, regressors: Sequence[BasisRegressor], joints: Sequence[str], dt: float) -> None:
-        """Create the regressors without memory.
+        """Prepare the regressors; the first `step` starts their memory.
 
         Args:
             regressors: the regressors.
@@ -186,7 +188,7 @@ class RunningRegressors:
         Args:
             tau: N m, prediction without regressors, (..., J).
             now: signals of this step.
-            new: environments that start from rest, (...,) bool, or None.
+            new: environments that start from rest, (...,) bool, or None; all at the first step.
 
         Returns:
             N m, torque to add, (..., J), or 0 without regressors.

@@ -1,4 +1,7 @@
-"""Gains that vary with torque sign, time, temperature or voltage; coupling between joints.
+"""Effects that scale the drive's torque, by its sign, time, temperature, voltage or power; coupling of joints.
+
+A gain is here the ratio of delivered to commanded torque. The deviations of kp and kd are
+`delta_kp` and `delta_kd` of `parameters`.
 
 The identification that finds them in logs is a package of its own.
 """
@@ -35,8 +38,8 @@ from .dynamics import lag_series, lag_step
 class GainAsymmetry(TorqueEffect):
     """Gain that depends on the sign of the torque: tau* (1 + a sign(tau*)).
 
-    `commanded` names the direction that has the commanded gain: the `mean` of both, or the `weaker`
-    one; then all is divided by 1 - |a|.
+    The commanded gain is the mean of both directions (`commanded: mean`), or that of the weaker one
+    (`weaker`), which divides the torque by 1 - |a|.
 
     Attributes:
         commanded: `mean` or `weaker`.
@@ -65,7 +68,8 @@ class ThermalDrift(TorqueEffect):
 
     Attributes:
         of: `time` or `temperature`.
-        cold: degrees Celsius, temperature at which the gain is nominal: the lowest one of the log.
+        cold: degrees Celsius, temperature at which the gain is nominal; the identification sets it to the
+            lowest one of the log.
     """
 
     name = "thermal_drift"
@@ -100,7 +104,7 @@ class SupplySag(TorqueEffect):
     Attributes:
         what: `gain` or `bound`.
         full: V, supply voltage without load.
-        of: `voltage` or `power`.
+        of: `voltage` or `power`; with `power`, `from_settings` returns a `PowerSag`.
     """
 
     name = "supply_sag"
@@ -139,7 +143,7 @@ class SupplySag(TorqueEffect):
 
 @attrs.frozen(eq=False)
 class PowerSag(MemoryEffect):
-    """Gain or torque limit that falls by 1 - sag P_f with the power of all joints.
+    """Gain or torque limit that falls as 1 - sag P_f; P_f (W) is the filtered mechanical power of all joints.
 
         T dP_f/dt = P - P_f, P = sum over joints of max(tau* dq, 0)
 
@@ -196,21 +200,21 @@ def drawn_power(torque: Array, dq: Array) -> Array:
     return np.broadcast_to(power.sum(axis=-1, keepdims=True), power.shape)
 
 
-def _apply_sag(what: str, x: Array, strain: Array, p: Params) -> Array:
-    """Scale the torque, or its limit, by max(1 - sag strain, 0)."""
-    left = np.maximum(1.0 - p["sag"] * strain, 0.0)
-    return x * left if what == "gain" else np.clip(x, -p["limit"] * left, p["limit"] * left)
+def _apply_sag(what: str, x: Array, drop: Array, p: Params) -> Array:
+    """Scale the torque, or its limit, by max(1 - sag drop, 0)."""
+    factor = np.maximum(1.0 - p["sag"] * drop, 0.0)
+    return x * factor if what == "gain" else np.clip(x, -p["limit"] * factor, p["limit"] * factor)
 
 
 @attrs.frozen(eq=False)
 class CrossCoupling(AddedEffect):
-    """Coupling to another joint: a times its q, dq or tau; for q plus an offset.
+    """Coupling: adds a times q, dq or tau of another joint, and for q an offset.
 
-    tau is the torque that the other drive gives without such effects: a measured one would carry
-    its noise over.
+    tau is the other drive's torque before added effects, because a measured torque would add its
+    noise.
 
     Attributes:
-        source: signal for each joint, such as `FR_thigh_joint/dq`.
+        source: for each joint with the effect, the other joint's signal, such as `FR_thigh_joint/dq`.
         columns: signal and joint index of each `source`.
     """
 

@@ -11,7 +11,10 @@ from .time import Time
 
 
 class Clock(Partial):
-    """Clock of a type; ROS time is system time unless /clock drives it (parameter use_sim_time).
+    """A system, steady or ROS clock. ROS time is system time, or that of /clock with use_sim_time.
+
+    With use_sim_time a node sets ROS time to 0 until the first message of /clock. Its timers follow
+    /clock directly, and the steady clock otherwise: they do not call `now`.
 
     Attributes:
         clock_type: Type of the clock.

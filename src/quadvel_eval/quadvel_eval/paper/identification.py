@@ -111,8 +111,8 @@ def record_foot_lifting(robot: Robot, seed: int, seconds: float) -> Log:
     rise = np.linspace(0.0, 1.0, round(TRANSITION_TIME_S / CONTROL_PERIOD_S))[:, None]
     for target in np.vstack([start + rise * (targets[0] - start), targets]):
         state = simulator.state()
-        q = limit_torque(robot, target, state.q, state.dq, robot.kp, robot.kd)
-        simulator.command(JointCommand(q=q, kp=kp, kd=kd))
+        limited = limit_torque(robot, target, state.q, state.dq, robot.kp, robot.kd)
+        simulator.command(JointCommand(q=limited, kp=kp, kd=kd))
         simulator.step(SIMULATOR_STEPS_PER_TICK)
     return simulator.log(f"Eq. 9, seed {seed}", TRANSITION_TIME_S)
 
@@ -199,9 +199,9 @@ class Identification(Section):
         "A simulated robot whose drives are those of the paper's Table 4 does the foot-lifting motion of Eq. 9 for 5 s, "
         "commanded at 200 Hz and recorded at 1 kHz; `quadvel identify` fits that log. Errors are those on logs that were not "
         "fitted: the same motion with other noise, and a walk with standing, running, turning and stops. The truth is known "
-        "here: parameters should come back (input delay 7 ms, output delay 1 ms; on a log with 1 ms between rows a sum of "
-        "delays of 8 ms is indistinguishable from anything above 7), and the error should be the torque noise of 0.066 N² m². The "
-        "paper's second error holds what its model lacks; our simulated drives hold no such thing."
+        "here: parameters should come back (input delay 7 ms, output delay 1 ms; with 1 ms between rows, any sum of delays "
+        "above 7 and up to 8 ms looks the same), and the error should be the torque noise of 0.066 N² m². The paper's second "
+        "error includes effects that its model lacks; our simulated drives have none."
     )
     data: tuple[str, ...] = tuple(PAPER_VALUES)
     seconds: float = 5.0

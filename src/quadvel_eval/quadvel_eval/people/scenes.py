@@ -17,9 +17,10 @@ from quadvel_sim.walker import Walker, leg_circles
 
 from .laser import FloorPlan, Laser
 
-WALKING_STEP_S = 0.01  # simulation step of the people
+WALKING_STEP_S = 0.005  # simulation step of the people; divides the periods of SCAN_RATES_HZ
 RESOLUTIONS = np.deg2rad([0.25, 0.36, 0.5, 1.0])  # rad between two rays
 SCAN_RATES_HZ = (10.0, 20.0, 40.0)
+HIDDEN_S = 1.5  # for which the person of `occlusion` is behind the tree
 
 
 @attrs.frozen
@@ -28,7 +29,7 @@ class SceneScan:
 
     Attributes:
         time: Time since the start of the scene, s.
-        ranges: Ranges, (rays,), m; no return is as `Laser.no_return` states.
+        ranges: Ranges, (rays,), m; `Laser.no_return` (0, NaN or inf) where there is no echo.
         pose: x, y (m) and yaw (rad) of the scanner in the world frame.
         people: True positions of the people in the world frame, (people, 2), m.
     """
@@ -102,7 +103,7 @@ def crossing(seed: int) -> Scene:
 
 
 def occlusion(seed: int) -> Scene:
-    """Create a person who is hidden behind a tree for 1.5 s.
+    """Create a person who is hidden behind a tree for HIDDEN_S.
 
     Args:
         seed: Seed of the scene.
@@ -111,11 +112,11 @@ def occlusion(seed: int) -> Scene:
         The scene.
     """
     rng = np.random.default_rng([2, seed])
-    distance, speed, hidden = rng.uniform(2.5, 5.0), rng.uniform(0.8, 1.4), 1.5
+    distance, speed = rng.uniform(2.5, 5.0), rng.uniform(0.8, 1.4)
     to_tree = distance * rng.uniform(0.4, 0.6)
     # The shadow of the tree at the walker's distance has width 2 r distance / to_tree; the walker
-    # crosses it in `hidden` seconds.
-    radius = 0.5 * hidden * speed * to_tree / distance
+    # crosses it in HIDDEN_S.
+    radius = 0.5 * HIDDEN_S * speed * to_tree / distance
     side = rng.choice([-1.0, 1.0])
     way = np.array([[distance, -3.0 * side * speed], [distance, 4.0 * side * speed]])
     turn = rng.uniform(-np.pi, np.pi)

@@ -1,6 +1,6 @@
 """Imports a policy: from weights and configuration to one ONNX file that runs here.
 
-The network stays as it is; only its metadata and its list of operator sets change.
+The network stays as it is; only its metadata changes.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Supplement:
     """Values that a format may lack.
 
     Attributes:
-        limits: Largest commands of the training: vx, vy (m/s), wz (rad/s), each for both
-            directions; None: those of the format.
+        limits: Largest commands of the training, to either side: vx, vy (m/s), wz (rad/s); None:
+            those of the format.
         rate_hz: Rate of the policy, Hz; None: that of the format.
     """
 

@@ -1,7 +1,7 @@
-"""Identification without measured torque: the motion of free limbs implies the joint torques.
+"""Identification without measured torque: from the motion of limbs that touch nothing.
 
-Accelerations are linear in the torques and in a load that depends on angles and speeds. Both are
-fitted together with the PD law and with friction. The torque that the motion then implies
+Accelerations are linear in the torques and in a load that depends on angles and speeds. Inertia and
+load are fitted together with the torques of the PD law and of friction. The torque that the motion then implies
 replaces the measured one, and the same identification runs on it. Its scale is that of the
 commanded gains. The improvement is stated in rad and rad/s, from a replay of the commands over
 short stretches. There is no model of contacts: the robot has to be suspended.
@@ -30,7 +30,7 @@ _DELAY_STEP_S = 0.0005
 _MAX_STEP_S = 0.001
 """s; longest time step of the replay."""
 _MAX_LIMB_JOINTS = 4
-"""Most joints of a limb, which carry each other."""
+"""Largest number of joints that are fitted together as one limb; larger groups are split into joints."""
 _RIDGE = 1e-5
 """Ridge penalty on the regression's normalised weights, times the number of rows."""
 
@@ -221,8 +221,8 @@ class Body:
             "motion": {
                 "inertia": {"value": self.inertia.tolist(), "unit": "kg m^2"},
                 "replayed_s": self.stretch_s,
-                "text": "No torque was logged. It is inferred from the motion, so that the inertia contains an armature and "
-                "the torque offset contains an encoder bias.",
+                "text": "No torque was logged. It is inferred from the motion, so that the inertia includes that of the rotor, "
+                "and a bias of an encoder appears as a torque offset.",
                 "before": before,
                 "after": after,
             }
@@ -232,8 +232,7 @@ class Body:
 def average_over_steps(log: Log) -> tuple[Log, Array]:
     """Average a log over steps of `_AVERAGING_S` and compute the accelerations in them.
 
-    Commands are stamped half a step later, so that their mean over a step that starts at a row is
-    that of the row's own step.
+    The times of rows move to the middle of their step, and those of commands by the same half step.
 
     Args:
         log: The log.

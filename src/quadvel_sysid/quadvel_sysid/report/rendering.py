@@ -1,4 +1,8 @@
-"""Render the HTML of report pages from the templates in `templates/`; values are escaped."""
+"""HTML building blocks (tables, tiles, figures) that several pages share; values are escaped.
+
+`page` decides what the report of the identification shows, `figures` draws, and
+`templates/report.html.j2` places it.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
 """Library of candidate regressors of named signals, and their refinement.
 
-`regressors` evaluates them, and `candidates` screens and fits them.
+A candidate is a shape of a signal (`quadvel_actuator.effects.shapes`), times a factor (`MULTIPLIERS`
+of `quadvel_actuator.effects.basis_regressors`: direction, dq or tau). `candidates` ranks them quickly
+and fits the best. Shapes: N rows, C columns, one for each joint or one for all.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ _DAMPING_RATIOS = 0.02, 0.07, 0.2
 _HISTORY_S = 0.02
 """Span of filters over a signal's past, s."""
 _WAVE_RATES = np.arange(3.0, 120.0, 0.5)
-"""Phase of a wave per angle of the joint, rad/rad."""
+"""Waves per 2 pi of the joint's angle."""
 _CURVE_PIECES = 6
 """Pieces of a curve."""
 _FINE_PIECES, _MAX_PIECES = 25, 100
@@ -49,10 +51,10 @@ def regressor_candidates(context: Context) -> Iterator[RegressorCandidate]:
     for name, times in (("q", ""), ("q", "direction"), ("dq", ""), ("t", ""), ("q", "tau")):
         yield make.curve(name, times, _FINE_PIECES)
     rows = max(round(_HISTORY_S / make.dt), 4)
-    edges = tuple(make.dt * np.unique(np.round(np.geomspace(1, rows, 7))))
-    long = tuple(make.dt * np.unique(np.round(np.linspace(1, 3 * rows, 12))))
+    filter_ages = tuple(make.dt * np.unique(np.round(np.geomspace(1, rows, 7))))
+    long_filter_ages = tuple(make.dt * np.unique(np.round(np.linspace(1, 3 * rows, 12))))
     for name in ("tau", "q_des", "q", "dq"):
-        yield make(name, "", Filter(edges), DRIVE)
+        yield make(name, "", Filter(filter_ages), DRIVE)
     for name in ("tau", "q"):
         yield from (make(name, "", Lag(float(time))) for time in _LAG_TIMES_S)
         for frequency in _RESONANCE_FREQUENCIES_HZ[0.35 / make.dt > _RESONANCE_FREQUENCIES_HZ]:
@@ -61,10 +63,10 @@ def regressor_candidates(context: Context) -> Iterator[RegressorCandidate]:
         for name in ("q", "dq", "tau"):
             for times in ("", "direction", "tau", "dq"):
                 yield make.curve(f"{joint}/{name}", times, _CURVE_PIECES if not times else 3)
-        yield make(f"{joint}/tau", "", Filter(long))
-        yield make(f"{joint}/q", "", Filter(edges))
-        yield from make.ripples(joint)
-    yield from make.lines()
+        yield make(f"{joint}/tau", "", Filter(long_filter_ages))
+        yield make(f"{joint}/q", "", Filter(filter_ages))
+        yield from make.angle_waves(joint)
+    yield from make.time_waves()
 
 
 class _RegressorFactory:
@@ -77,7 +79,7 @@ class _RegressorFactory:
         self._ranges: dict[str, Curve] = {}
 
     def __call__(self, of: str, times: str, shape: Shape, at: str = "") -> RegressorCandidate:
-        """Create a regressor: in the drive for commanded signals, else at the joint."""
+        """Create a regressor: in the drive if signal or factor is one of `DRIVE_SIGNALS`, else at the joint."""
         if not at:
             at = DRIVE if of in DRIVE_SIGNALS or times in DRIVE_SIGNALS else JOINT
         return RegressorCandidate(SignalRegressor(of, times, shape, self.joints, at=at))
@@ -102,7 +104,7 @@ class _RegressorFactory:
             self._ranges[of] = Curve(low, np.maximum(high, low + 1e-9), pieces)
         return self(of, times, attrs.evolve(self._ranges[of], pieces=pieces))
 
-    def ripples(self, joint: str) -> Iterator[RegressorCandidate]:
+    def angle_waves(self, joint: str) -> Iterator[RegressorCandidate]:
         """Create a wave along another joint's angle, at the rate of most residual power.
 
         Args:
@@ -118,7 +120,7 @@ class _RegressorFactory:
             power = np.abs(np.exp(-1j * rates[:, None] * u[:, 0]) @ self._context.residual) ** 2
             yield self(f"{joint}/q", "", Wave(rates[np.argmax(power.max(axis=1))], 2))
 
-    def lines(self) -> Iterator[RegressorCandidate]:
+    def time_waves(self) -> Iterator[RegressorCandidate]:
         """Create waves at the strongest spectral lines of the residual over time.
 
         Yields:

@@ -2,7 +2,7 @@
 
 A drive that was switched off or damped while the last command stays in the log shows it: the
 torque no longer responds to the position error. The data show this without gains; if gains are
-logged, kp = 0 shows it as well.
+logged, kp = 0 shows it as well. `explainable_rows` returns the other rows. Shapes: N rows, J joints.
 """
 
 from __future__ import annotations
@@ -39,12 +39,10 @@ MAX_LAG_ROWS = 40_000
 MAX_FIT_ROWS, MIN_FIT_ROWS = 4000, 200
 """Rows that a PD law is fitted to: at least `MIN_FIT_ROWS`, at most `MAX_FIT_ROWS`."""
 MAX_ERROR_RATIO = 9.0
-"""A stretch with at most this many times the mean squared error elsewhere was under PD control."""
+"""A stretch with at most this many times the mean squared error elsewhere counts as under PD control."""
 
 MAX_OFFSET_ERROR_RATIO = 0.5
-"""A torque has a constant offset if a PD law with one leaves at most this share of the squared error
-of a PD law without.
-"""
+"""A torque has a constant offset if it reduces the squared error of a PD law to at most this share."""
 
 
 def explainable_rows(log: Log) -> tuple[Bools, list[Finding]]:
@@ -101,7 +99,7 @@ def _lost_control(log: Log) -> tuple[Bools, list[Finding]]:
 
 
 def masked_rows(log: Log) -> Iterator[Finding]:
-    """Rows that the log itself says are not to be explained.
+    """Rows that the log itself marks as invalid.
 
     Args:
         log: The log to check.
@@ -166,7 +164,7 @@ def _low_gain_rows(log: Log) -> Bools:
     """Rows (N,) in windows whose gain from position error to torque is far below its usual value."""
     log = _without_offsets(log)
     steps = np.diff(((log.t - log.t[0]) / BIN_S).astype(np.intp), prepend=0)
-    # A gap shifts the bins by a whole window, so that no window bridges it.
+    # At a gap the numbers of the bins jump by a whole window, so that no window bridges it.
     bins = np.cumsum(np.minimum(steps, WINDOW_BINS))
     some = np.flatnonzero(bins % max(1, len(bins) // MAX_LAG_ROWS) == 0)
     lag = max(LAGS_S, key=lambda lag: _explained_share(_binned_sums(log, bins, some, lag)))
@@ -187,7 +185,7 @@ def _low_gain_rows(log: Log) -> Bools:
     usual = float(np.percentile(gain[informative], 75))
     if usual <= 0.0:
         return np.zeros(len(log.t), bool)
-    # Windows with a small error have no gain; use that of the window before.
+    # Windows with a small error give no reliable gain; use that of the window before.
     last = np.maximum.accumulate(np.where(informative, np.arange(len(gain)), -1))
     lost = ((last >= 0) & (gain[last] < LOST_GAIN_SHARE * usual))[bins]
     left = _relative_error(log, lost) if lost.any() else None
@@ -236,8 +234,8 @@ def _relative_error(log: Log, lost: Bools) -> Floats | None:
     """Squared error (N,) of a PD law of each joint, over its mean outside `lost`.
 
     None if the rows outside are too few. If the law holds within `lost` as well, the drives were
-    under PD control there: friction, or a load that turns against a small position error, looks
-    like a gain of 0.
+    under PD control there: friction, or a load with the sign opposite to that of a small position
+    error, looks like a gain of 0.
     """
     fitted = np.flatnonzero(~lost)
     fitted = fitted[:: max(1, len(fitted) // MAX_FIT_ROWS)]

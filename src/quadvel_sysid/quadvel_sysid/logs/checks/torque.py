@@ -1,6 +1,6 @@
 """Checks of the measured torque against its command: isolated spikes, and torque without a sign.
 
-`table` runs all checks in order; `response` finds which command a torque follows.
+`table` runs all checks in order. `response` finds which command a torque follows, and its unit.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from .response import EXPLAINED_ERROR_SHARE, TIME_ROUNDING_S, least_squares_resi
 LAGS_S = (0.0, 0.005, 0.01, 0.02, 0.04)
 """s; lags from a command to its torque that are tried."""
 BULK_QUANTILE = 0.8
-"""Quantile of the deviations that gives their scale: a tenth of the rows may be spikes, and a tenth
-of rows at rest, which deviate less, hardly changes it.
+"""Quantile of the deviations that gives their scale: a tenth of spikes, or of rows at rest, changes it
+little.
 """
 BULK_SIGMAS = 1.28
 """The same quantile of the magnitude of a standard normal variable."""
@@ -42,8 +42,8 @@ MIN_SIGN_SHARE = 0.05
 NEAR_ZERO_SHARE = 0.1
 """A quantity reaches 0 if its 5th percentile is below this share of its 95th percentile."""
 MAGNITUDE_ERROR_RATIO = 0.9
-"""A torque has no sign if the magnitude of a PD law leaves less than this share of the squared error
-of the PD law.
+"""A torque has no sign if the magnitude of a PD law fits it with less than this share of the squared
+error of the PD law itself.
 """
 
 
@@ -112,11 +112,9 @@ def _pd_regressors(log: Log, row: Indices, j: int, lag: float) -> Floats:
 def _local_median(x: Floats) -> tuple[Floats, Floats]:
     """Median (N,) of the four rows around each row, and the excess of the row over these.
 
-    The excess is how far the row is above the second largest of the four, or below (negative) the
-    second smallest.
-
-    The excess is 0 if it is less than half the range of these four: the peak of a fast motion is
-    no spike.
+    The excess is how far the row lies above the second largest of the four, or below (negative) the
+    second smallest. It is 0 if that is less than half the range of the four, as at the peak of a fast
+    motion.
     """
     padded = np.pad(x, 2, mode="edge")
     neighbours = np.sort([padded[k : k + len(x)] for k in (0, 1, 3, 4)], axis=0)
@@ -159,7 +157,7 @@ def unsigned_torque(log: Log) -> Iterator[Finding]:
     row = row[:: max(1, len(row) // MAX_FIT_ROWS)]
     tau = np.asarray(log.tau[row], dtype=float)
     error = np.stack([_pd_regressors(log, row, j, 0.0)[:, 0] for j in range(len(log.joints))], axis=1)
-    # An offset above a turn is one of the counting of turns, not of the control.
+    # An offset of more than one turn comes from a counter of turns, and is removed.
     error -= np.median(error, axis=0) * (np.abs(np.median(error, axis=0)) > TURN_RAD)
     hit = lacks_sign(tau, error)
     for j in np.flatnonzero(hit):
@@ -174,12 +172,12 @@ def unsigned_torque(log: Log) -> Iterator[Finding]:
         yield Finding("refusal", "tau", joints, text)
 
 
-def lacks_sign(values: Floats, twin: Floats) -> Bools:
+def lacks_sign(values: Floats, related: Floats) -> Bools:
     """Find joints whose values keep one sign although a related signal changes its sign.
 
     Args:
         values: (N, J) values under test.
-        twin: (N, J) signal that should share their sign.
+        related: (N, J) signal that should share their sign.
 
     Returns:
         (J,) mask.
@@ -187,16 +185,16 @@ def lacks_sign(values: Floats, twin: Floats) -> Bools:
     size = np.abs(values)
     one_way = ((values >= 0.0).all(axis=0) | (values <= 0.0).all(axis=0)) & (np.ptp(values, axis=0) > 0.0)
     touches = np.percentile(size, 5, axis=0) < NEAR_ZERO_SHARE * np.percentile(size, 95, axis=0)
-    scale = 0.1 * np.sqrt(np.mean(twin**2, axis=0))
-    both = np.minimum((twin > scale).mean(axis=0), (twin < -scale).mean(axis=0)) > MIN_SIGN_SHARE
+    scale = 0.1 * np.sqrt(np.mean(related**2, axis=0))
+    both = np.minimum((related > scale).mean(axis=0), (related < -scale).mean(axis=0)) > MIN_SIGN_SHARE
     return np.asarray(one_way & touches & both)
 
 
 def is_magnitude(values: Floats, signals: Floats) -> bool:
     """Decide whether values are the magnitude of a linear combination of signals.
 
-    If y = |x w|, then y^2 = sum_ab W_ab x_a x_b with W = w w^T. A linear fit gives W; the signs
-    of its first eigenvector's combination start an alternation between signs and weights.
+    If y = |x w|, then y^2 = sum_ab W_ab x_a x_b with W = w w^T. A linear fit gives W, and its
+    first eigenvector the first signs; then weights and signs are fitted in turn.
 
     Args:
         values: (N,) values y.
