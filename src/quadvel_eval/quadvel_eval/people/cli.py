@@ -27,7 +27,7 @@ HEADS = {
     "switches_per_minute": "switches a minute",
     "kept": "right person kept",
     "rms": "position, m RMS",
-    "ghosts": "ghosts a scene",
+    "ghosts": "false tracks a scene",
     "ms": "CPU ms a scan",
 }
 
