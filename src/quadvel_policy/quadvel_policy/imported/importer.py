@@ -6,6 +6,7 @@ The network stays as it is; only its metadata changes.
 from __future__ import annotations
 
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import attrs
@@ -60,7 +61,8 @@ def import_policy(
         ValueError: A file or a field is missing or does not fit; the message names file and field,
             the value found and the value expected.
     """
-    fields = None if config is None else _read_known(config)
+    fields = None if config is None else read_yaml(config, "a deploy.yaml or a config.yaml")
+    reader = mjlab if config is None else _format_of(config, fields)
     if weights.suffix in PICKLED and weights.exists():
         raise NetworkFileError(
             f"{weights}: is TorchScript, which can run code when it is opened, expected ONNX: convert it "
@@ -71,8 +73,7 @@ def import_policy(
     if config is None:
         metadata = _read_mjlab(robot, weights, model, output, supplement)
     else:
-        metadata = _read_config(robot, config, fields, output, supplement)
-    reader = mjlab if config is None else unitree_rl_lab if unitree_rl_lab.is_deploy_yaml(fields) else rl_sar
+        metadata = _read_config(robot, config, reader, fields, output, supplement)
     _check_posture(robot, f"{config or weights}: {reader.POSTURE_FIELD}", metadata)
     entry = message("StringStringEntryProto", key=IMPORTED_KEY, value=metadata.to_json())
     model = attrs.evolve(model, fields=model.fields | {"metadata_props": [entry]})
@@ -80,15 +81,16 @@ def import_policy(
     return metadata, serialise(model)
 
 
-def _read_known(config: Path) -> Any:
-    """Return the content of a configuration file of a known format."""
-    fields = read_yaml(config, "a deploy.yaml or a config.yaml")
-    if not unitree_rl_lab.is_deploy_yaml(fields) and not rl_sar.is_config(fields):
-        raise FormatError(
-            f"{config}: found no joint_ids_map and no single key 'robot/policy', expected "
-            "unitree_rl_lab's deploy.yaml or rl_sar's config.yaml"
-        )
-    return fields
+def _format_of(config: Path, fields: Any) -> ModuleType:
+    """Return the module that reads the content of a configuration file."""
+    if unitree_rl_lab.is_deploy_yaml(fields):
+        return unitree_rl_lab
+    if rl_sar.is_config(fields):
+        return rl_sar
+    raise FormatError(
+        f"{config}: found no joint_ids_map and no single key 'robot/policy', expected "
+        "unitree_rl_lab's deploy.yaml or rl_sar's config.yaml"
+    )
 
 
 def _read_mjlab(
@@ -108,12 +110,12 @@ def _read_mjlab(
 
 
 def _read_config(
-    robot: Robot, config: Path, fields: Any, output: str, supplement: Supplement
+    robot: Robot, config: Path, reader: ModuleType, fields: Any, output: str, supplement: Supplement
 ) -> ImportedMetadata:
     """Read the content of a configuration file."""
     if supplement.rate_hz is not None:
         raise FormatError(f"{config}: has its own rate, expected no --rate")
-    if unitree_rl_lab.is_deploy_yaml(fields):
+    if reader is unitree_rl_lab:
         if supplement.limits is not None:
             raise FormatError(f"{config}: commands: has its own ranges, expected no --limits")
         return unitree_rl_lab.read(config, fields, robot.name, output)
