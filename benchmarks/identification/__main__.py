@@ -78,7 +78,7 @@ def enter_command(
             "versions": library_versions(LIBRARIES),
             "logs": {
                 shared.name: _timed(ENTRANTS[name], shared)
-                for shared in track(logs, name, console=Console(stderr=True))
+                for shared in track(logs, name, console=Console(markup=False, stderr=True))
             },
         }
         (folder / "answers" / f"{name}.json").write_text(json.dumps(content))

@@ -136,13 +136,15 @@ def main(
             for switch, kind, index, path in cases
             if not path.exists()
         ]
-        for one in track(as_completed(todo), "Scoring", total=len(todo), console=Console(stderr=True)):
+        for one in track(
+            as_completed(todo), "Scoring", total=len(todo), console=Console(markup=False, stderr=True)
+        ):
             one.result()
     rows = {
         switch: {path.stem: json.loads(path.read_text()) for path in sorted((out / switch).glob("*.json"))}
         for switch in asked
     }
-    Console().print(table(rows), markup=False, highlight=False, soft_wrap=True)
+    Console(markup=False).print(table(rows), highlight=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ def walks(
         cells += [f"{seconds:.0f}", ", ".join(one["name"] for one in report["effects"])]
         print(f"| {fitted}, {judged} | {' | '.join(cells)} |", flush=True)
         for text in (report["decision"], *report["warnings"]):
-            Console(stderr=True).print(text, markup=False, highlight=False)
+            Console(markup=False, stderr=True).print(text, highlight=False)
 
 
 @app.command()

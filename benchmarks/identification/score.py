@@ -134,7 +134,7 @@ def run_campaign(
     with ProcessPoolExecutor(jobs, mp_context=context) as pool:
         futures = [pool.submit(_work, kind, index, seed, generator, path) for kind, index, path in missing]
         for future in track(
-            as_completed(futures), "Scoring", total=len(futures), console=Console(stderr=True)
+            as_completed(futures), "Scoring", total=len(futures), console=Console(markup=False, stderr=True)
         ):
             future.result()
     return [
@@ -177,7 +177,7 @@ def main(
     if write:
         PAGE.parent.mkdir(parents=True, exist_ok=True)
         PAGE.write_text(page)
-    Console().print(page, markup=False, highlight=False)
+    Console(markup=False).print(page, highlight=False)
 
 
 if __name__ == "__main__":

@@ -66,7 +66,7 @@ def table(size: SizeOption = "small", out: OutOption = OUT) -> None:
     entries = read_entries(out / size)
     if not entries:
         raise typer.BadParameter(f"{out / size}: found no entry; make one with `enter`")
-    Console().print(entries_table(entries), markup=False, highlight=False, soft_wrap=True)
+    Console(markup=False).print(entries_table(entries), highlight=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

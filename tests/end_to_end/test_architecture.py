@@ -97,3 +97,20 @@ def test_no_module_uses_private_names_of_others() -> None:
     found = {path.name: private_names(path) for path in paths if "rclpy" not in path.parts}
     allowed = PUBLIC_IN_PYTHON | NO_PUBLIC_WAY
     assert {name: names - allowed for name, names in found.items() if names - allowed} == {}
+
+
+def test_no_console_reads_markup_in_paths_and_messages():
+    """`[x]` in a path is text: a console of rich would drop it, or fail at `[/x]`."""
+    calls = [
+        (name, node)
+        for name, path in modules().items()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Console"
+    ]
+    assert calls
+    with_markup = [
+        f"{name}:{node.lineno}"
+        for name, node in calls
+        if not any(word.arg == "markup" and ast.unparse(word.value) == "False" for word in node.keywords)
+    ]
+    assert with_markup == []

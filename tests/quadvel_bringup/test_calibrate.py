@@ -75,6 +75,14 @@ def calibrate(*arguments: object) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
+def test_a_robot_that_does_not_hang_is_refused_by_file(standing: Path, tmp_path: Path) -> None:
+    code, text = calibrate("--suspended", standing, "--out", tmp_path / "calibration.yaml")
+    assert code == 2
+    assert str(standing) in text
+    assert "--suspended" in text
+    assert not any(tmp_path.iterdir())
+
+
 def test_an_imu_that_leans_by_two_degrees_is_shown_and_written(standing: Path, tmp_path: Path) -> None:
     file = tmp_path / "calibration.yaml"
     code, text = calibrate("--standing", standing, "--out", file)

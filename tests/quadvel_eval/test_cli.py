@@ -73,6 +73,12 @@ def test_bench_fails_before_it_measures_if_it_cannot_write(
             bench_command(out)
 
 
+@pytest.mark.parametrize("options", [{"seconds": 5.0}, {"busy": 3}])
+def test_options_of_the_live_bench_are_refused_without_it(tmp_path: Path, options: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="belongs to --live"):
+        bench_command(tmp_path / "bench.json", **options)  # type: ignore[arg-type]
+
+
 def test_bench_writes_figures_and_reports_skipped_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -60,6 +60,8 @@ def test_joints_of_other_robots_are_drawn(tmp_path: Path, messages: list[Message
     )
     np.testing.assert_allclose(found.series["/low_cmd"][1], moved["q_des"], atol=1e-4)
     assert found.end == pytest.approx(SECONDS, abs=1e-3)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "velocity.png").write_text("of another recording")
     result = run(plot_command, path, "--out", tmp_path / "out")
     assert result.exit_code == 0
     assert {one.name for one in (tmp_path / "out").iterdir()} == {"joints.png", "torques.png"}

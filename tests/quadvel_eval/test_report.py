@@ -122,6 +122,9 @@ def test_an_unwritable_folder_fails_before_the_work(folder: str) -> None:
 def test_an_unwritable_file_fails_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(IsADirectoryError, match="is a folder, expected a file to write"):
         output_file(tmp_path)
+    for nameless in (Path(), Path("/")):
+        with pytest.raises(IsADirectoryError, match="is a folder, expected a file to write"):
+            output_file(nameless)
     with pytest.raises(OSError, match="the file can't be written: File name too long"):
         output_file(tmp_path / ("x" * 300))
     assert output_file(tmp_path / "new" / "bench.json") == tmp_path / "new" / "bench.json"

@@ -81,7 +81,7 @@ def test_a_target_is_held_back_where_the_joint_is_far_from_it() -> None:
 
 
 def test_a_robot_that_tips_over_or_leaves_its_range_ends_the_motion() -> None:
-    with pytest.raises(MotionError, match=r"the trunk tilts by 0\.90 rad"):
+    with pytest.raises(MotionError, match=r"the trunk tilts by 0\.900 rad"):
         MotionPlayer(FootLifting(ALIENGO)).answer(state(0.0, tilt=0.9))
     q = ALIENGO.nominal_q.copy()
     q[5] = ALIENGO.upper[5] + 0.2
@@ -143,6 +143,64 @@ def test_after_a_report_it_says_what_to_record_next(tmp_path: Path) -> None:
     ended = subprocess.run(excite("--after", tmp_path / "report.json"), capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
     assert "quadvel excite creep --seconds 40\n  for coulomb_friction, stribeck_friction" in ended.stdout
+
+
+OTHER_ROBOT = """
+import sys
+import quadvel_dds
+quadvel_dds.install()
+from rclpy.node import Node
+from std_msgs.msg import String
+from quadvel_description.robot import load_robot
+from quadvel_msgs.msg import LowCmd, LowState
+from quadvel_nodes.node import request_exit, run
+from quadvel_nodes.robot_view import LATCHED
+
+class Robot(Node):
+    def __init__(self):
+        super().__init__("driver")
+        self.described = self.create_publisher(String, "robot_description", LATCHED)
+        self.described.publish(String(data=load_robot("go2").urdf_file.read_text()))
+        self.states = self.create_publisher(LowState, "low_state", 1)
+        self.create_subscription(LowCmd, "low_cmd", self.count, 10)
+        self.tick, self.commands = 0, 0
+        self.create_timer(0.01, self.send)
+        self.create_timer(60.0, lambda: request_exit(self))
+        self.create_timer(0.2, self.end_without_excite)
+        self.seen = False
+
+    def count(self, message):
+        print("moved", flush=True)
+
+    def send(self):
+        self.tick += 1
+        stamp = self.get_clock().now().to_msg()
+        self.states.publish(LowState(stamp=stamp, tick=self.tick, orientation_wxyz=[1.0, 0.0, 0.0, 0.0]))
+
+    def end_without_excite(self):
+        present = self.count_publishers("low_cmd") > 0
+        if self.seen and not present:
+            request_exit(self)
+        self.seen = self.seen or present
+
+run(Robot, [])
+"""
+
+
+def test_the_motion_of_another_robot_is_not_played(tmp_path: Path) -> None:
+    file = tmp_path / "creep.mcap"
+    robot = subprocess.Popen([sys.executable, "-c", OTHER_ROBOT], stdout=subprocess.PIPE, text=True)
+    ended = subprocess.run(
+        excite("creep", "--seconds", 1, "--low-level", "external", "--out", file),
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    moved, _ = robot.communicate(timeout=120)
+    assert ended.returncode == 1
+    assert "robot_description is that of 'go2', expected 'aliengo'" in ended.stdout
+    assert moved == ""
+    assert not file.exists()
 
 
 def test_without_a_robot_it_says_what_to_start_and_ends_with_2(

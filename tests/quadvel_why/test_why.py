@@ -13,6 +13,7 @@ import pytest
 from quadvel_bringup import cli
 from quadvel_policy.imported.importer import Supplement
 from quadvel_policy.policy_file import PolicyFile
+from quadvel_sysid.logs.readers.recordings import Topics
 from quadvel_why.diagnosis import Diagnosis, diagnose
 from quadvel_why.links import CAUSES
 from quadvel_why.links.contract import Gains
@@ -209,6 +210,19 @@ def test_the_command_writes_the_finding_and_ends_with_1(run: Run, tmp_path: Path
     assert answer["finding"]["cause"]
     assert answer["reports_walk"] is False
     assert (tmp_path / "out" / "why.png").stat().st_size > 1000
+
+
+def test_of_a_sound_walk_no_picture_stays_of_another_recording(walk: Path, tmp_path: Path) -> None:
+    (tmp_path / "why.png").write_text("of another recording")
+    with pytest.raises(SystemExit) as ended:
+        cli.command("why").main([str(walk), "--out", str(tmp_path)])
+    assert ended.value.code == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["why.json"]
+
+
+def test_topics_are_refused_for_a_recording_of_this_stack(walk: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="expected no --state-topic"):
+        read_run(walk, topics_of_log=Topics(state="foo"))
 
 
 def test_several_recordings_have_a_folder_each(run: Run, tmp_path: Path) -> None:

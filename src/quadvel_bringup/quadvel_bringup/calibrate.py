@@ -19,6 +19,7 @@ from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot, load_robot, robot_of_file
 from quadvel_description.robot_name import described_robot
 from quadvel_description.state import RobotState
+from quadvel_driver.calibration import CalibrationError
 from quadvel_driver.find_calibration import (
     CalibrationDataError,
     CalibrationFit,
@@ -89,16 +90,20 @@ def calibrate_command(
     chosen = _robot(recordings, robot)
     try:
         found = fit_calibration(chosen, _samples(suspended), _samples(standing))
-    except CalibrationDataError as error:
-        raise ValueError(f"{', '.join(map(str, recordings))}: {error}") from None
-    console = Console(soft_wrap=True)
+    except (CalibrationDataError, CalibrationError) as error:
+        raise ValueError(
+            f"{', '.join(map(str, recordings))}: {error}; expected a hung robot that creeps (--suspended), and one "
+            "that stands still (--standing)"
+        ) from None
+    console = Console(markup=False, soft_wrap=True)
     console.print(_table(found))
     for sentence in _findings(found, standing is not None):
         console.print(sentence, highlight=False)
     if found.unevenness > MAX_UNEVENNESS_M:
         uneven = f"{1e3 * found.unevenness:.0f} mm"
         console.print(
-            f"[yellow]the standing feet are {uneven} off a common plane: check the floor and the joints"
+            f"the standing feet are {uneven} off a common plane: check the floor and the joints",
+            style="yellow",
         )
     with atomic_write(out) as draft:
         draft.write_text(attrs.evolve(found.calibration, robot=chosen.name).to_yaml())

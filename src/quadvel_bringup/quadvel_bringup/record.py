@@ -45,7 +45,7 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> bool:
         OSError: The disk is full.
     """
     output_recording(path)
-    console, wanted = Console(stderr=True, soft_wrap=True), _absolute(topics)
+    console, wanted = Console(markup=False, stderr=True, soft_wrap=True), _absolute(topics)
     with created_folder(path.parent):
         counts, present = _record_until(path, wanted, seconds, console)
         is_empty = not counts.keys() - ({DESCRIPTION_TOPIC} - set(wanted))
@@ -120,7 +120,7 @@ def record_faults(folder: Path, topics: Sequence[str], before: float, seconds: f
     from .recording_file import RingBuffer
     from .session import Session
 
-    console, ring = Console(stderr=True, soft_wrap=True), RingBuffer(before + AFTER_FAULT_S)
+    console, ring = Console(markup=False, stderr=True, soft_wrap=True), RingBuffer(before + AFTER_FAULT_S)
     wanted = _absolute(topics)
     ends = _end(seconds)
     faults = FaultTrigger(ControllerState.FAULT)

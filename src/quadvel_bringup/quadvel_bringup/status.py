@@ -15,6 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rich.console import Console
+from rich.text import Text
 
 from quadvel_description.kinematics import roll_pitch
 from quadvel_description.quadruped import JOINT_NAMES
@@ -44,10 +45,10 @@ FILE_KEYS = ("robot", "actuator", "policy")
 """Keys of /diagnostics with the files of a node."""
 RATES = ("low_state", "velocity_estimate", "controller/state", "command", "odom")
 LEVELS = {
-    DiagnosticStatus.OK: "[green]ok",
-    DiagnosticStatus.WARN: "[yellow]warning",
-    DiagnosticStatus.ERROR: "[bold red]error",
-    DiagnosticStatus.STALE: "[red]stale",
+    DiagnosticStatus.OK: Text("ok", style="green"),
+    DiagnosticStatus.WARN: Text("warning", style="yellow"),
+    DiagnosticStatus.ERROR: Text("error", style="bold red"),
+    DiagnosticStatus.STALE: Text("stale", style="red"),
 }
 Heard = Mapping[str, deque[Any]]
 
@@ -80,18 +81,23 @@ def status(joints: bool = False) -> int:
     with Session("status") as session:
         heard = {topic: session.listen(kind, topic, keep=1000) for topic, kind in STATUS_TOPICS.items()}
         _wait_for_reports(session, heard["/diagnostics"])
-        conflicts = [f"[yellow]warning[/] {conflict}" for conflict in all_conflicts(session.node)]
+        conflicts = [
+            _labelled(DiagnosticStatus.WARN, str(conflict)) for conflict in all_conflicts(session.node)
+        ]
         robots = session.node.count_publishers("low_state")
         if robots > 1:
             conflicts.append(
-                f"[red]error[/] low_state has {robots} publishers, expected 1: end all but one; "
-                f"they are {describe_robots()}; the lines show one node of each name"
+                _labelled(
+                    DiagnosticStatus.ERROR,
+                    f"low_state has {robots} publishers, expected 1: end all but one; "
+                    f"they are {describe_robots()}; the lines show one node of each name",
+                )
             )
     nodes = nodes_from_diagnostics(heard["/diagnostics"])
     if not nodes:
         print(f"no robot runs; start one: quadvel up; {discovery_hint()}")
         return 1
-    console = Console(soft_wrap=True, highlight=False)
+    console = Console(markup=False, soft_wrap=True, highlight=False)
     rows = [
         *_nodes(nodes),
         *(("topic", conflict) for conflict in conflicts),
@@ -101,7 +107,7 @@ def status(joints: bool = False) -> int:
     ]
     width = max(13, *(len(name) for name, _ in rows))
     for name, text in rows:
-        console.print(f"{name:{width}} {text}")
+        console.print(Text.assemble(f"{name:{width}} ", text))
     states = heard["controller/state"]
     failed = any(node.level == DiagnosticStatus.ERROR for node in nodes.values())
     return 1 if failed or robots > 1 or not states or states[-1].mode_name == "fault" else 0
@@ -152,13 +158,18 @@ def nodes_from_diagnostics(arrays: deque[Any]) -> dict[str, NodeReport]:
     return dict(sorted(nodes.items()))
 
 
-def _nodes(nodes: Mapping[str, NodeReport]) -> Iterator[tuple[str, str]]:
+def _labelled(level: bytes, text: str) -> Text:
+    """Return a text with a level of DiagnosticStatus in front."""
+    return Text.assemble(LEVELS[level], f" {text}")
+
+
+def _nodes(nodes: Mapping[str, NodeReport]) -> Iterator[tuple[str, Text]]:
     """Yield name and health of each node."""
     for name, node in nodes.items():
-        yield name, f"{LEVELS[node.level]}[/] {node.summary}"
+        yield name, _labelled(node.level, node.summary)
 
 
-def _lines(heard: Heard) -> Iterator[tuple[str, str]]:
+def _lines(heard: Heard) -> Iterator[tuple[str, str | Text]]:
     """Yield name and text of each line on mode, velocity and rates."""
     states, commands, estimates = heard["controller/state"], heard["command"], heard["velocity_estimate"]
     if states:
@@ -177,7 +188,7 @@ def _lines(heard: Heard) -> Iterator[tuple[str, str]]:
         loop = f"p99 of its period {period} ms, {compute} us from state to command"
         yield "loop", f"{state.rate_hz:.0f} Hz, {loop}, {state.overruns} deadlines missed"
     else:
-        yield "mode", "[red]no controller is running"
+        yield "mode", Text("no controller is running", style="red")
     if estimates:
         fell = bool(states) and states[-1].mode_name == "fault"
         note = "; wrong while the robot falls or lies" if fell else ""

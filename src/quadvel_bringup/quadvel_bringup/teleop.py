@@ -19,7 +19,7 @@ import attrs
 import numpy as np
 from geometry_msgs.msg import Twist
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from quadvel_msgs.msg import ControllerState
 from quadvel_msgs.srv import SetMode
@@ -240,7 +240,7 @@ def _drive(
 
     `note` precedes the state of the robot.
     """
-    console = Console(soft_wrap=True)
+    console = Console(markup=False, soft_wrap=True)
     with StopSignals() as signals, Session("teleop") as session:
         teleop = Teleop(session)
         teleop.wait_for_robot()
@@ -248,7 +248,7 @@ def _drive(
             with console.status("") as status:
                 while not signals.received:
                     teleop.serve_period(hear(teleop))
-                    status.update(escape(note() + teleop.status_line(speed(), way_out)))
+                    status.update(Text(note() + teleop.status_line(speed(), way_out)))
         finally:
             teleop.send_zero()
 

@@ -33,7 +33,7 @@ def up(stack: Stack, view: bool = False) -> int:
     if stack.brings_robot:
         check_exclusive()
     nodes = stack.commands(view)
-    say = PrefixedOutput(["quadvel", *nodes], Console(soft_wrap=True))
+    say = PrefixedOutput(["quadvel", *nodes], Console(markup=False, soft_wrap=True))
     with StopSignals() as signals, ProcessGroup(say) as group:
         say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them, `quadvel status` shows their health")
         for name, command in nodes.items():

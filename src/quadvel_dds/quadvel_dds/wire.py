@@ -53,7 +53,7 @@ def domain_configuration() -> str:
         Configuration for Cyclone DDS.
 
     Raises:
-        ValueError: ROS_AUTOMATIC_DISCOVERY_RANGE has an unknown value.
+        ValueError: ROS_AUTOMATIC_DISCOVERY_RANGE or ROS_STATIC_PEERS has a wrong value.
     """
     reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "LOCALHOST"
     if reach not in DISCOVERY_RANGES:
@@ -65,7 +65,7 @@ def domain_configuration() -> str:
         discovery = f"<ParticipantIndex>none</ParticipantIndex><Tag>ros_discovery_off_{os.getpid()}</Tag>"
     elif reach != "SYSTEM_DEFAULT":
         peers = ["localhost"] if reach == "LOCALHOST" else []
-        peers += [peer for peer in os.environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
+        peers += _static_peers()
         addresses = "".join(f'<Peer address="{peer}" pruneDelay="inf"/>' for peer in peers)
         discovery = (
             f"<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex>"
@@ -73,6 +73,20 @@ def domain_configuration() -> str:
         )
     own = f"<CycloneDDS><Domain>{general}<Discovery>{discovery}</Discovery></Domain></CycloneDDS>"
     return ",".join(filter(None, [own, os.environ.get("CYCLONEDDS_URI")]))
+
+
+def _static_peers() -> list[str]:
+    """Return the hosts of ROS_STATIC_PEERS; Cyclone would abort the process for one that is unknown."""
+    peers = [peer.strip() for peer in os.environ.get("ROS_STATIC_PEERS", "").split(";") if peer.strip()]
+    for peer in peers:
+        try:
+            socket.getaddrinfo(peer, None)
+        except (OSError, UnicodeError):
+            raise ValueError(
+                f"ROS_STATIC_PEERS: found {peer!r}, which this computer cannot resolve, expected names or "
+                "addresses of hosts, separated by ;"
+            ) from None
+    return peers
 
 
 _joined: dict[int, Domain] = {}

@@ -35,6 +35,7 @@ ClusterOption = Annotated[
 ]
 
 
+LIVE_S = 60.0  # duration of `quadvel bench --live`
 RobotOption = Annotated[
     str,
     typer.Option(
@@ -93,7 +94,7 @@ def eval_command(
         LearnedEstimator(chosen, setup.estimator_file)
     if actuator is not None:
         ActuatorParameters.load(chosen, actuator)
-    folder, console = output_folder(out), Console()
+    folder, console = output_folder(out), Console(markup=False)
     commands = [cell.command for cell in grid_cells(grid, 1)]
     if beyond := sum(not is_within_limits(command, limits) for command in commands):
         console.print(
@@ -117,7 +118,7 @@ def walk_progress_bar() -> Progress:
         The bar.
     """
     columns = (TextColumn("walks"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=Console(stderr=True))
+    return Progress(*columns, console=Console(markup=False, stderr=True))
 
 
 def faults_command(
@@ -149,7 +150,7 @@ def faults_command(
         task = bar.add_task("walks", total=None)
         runs = run_campaign(robot, seeds, only, lambda done, of: bar.update(task, completed=done, total=of))
     cases = write_campaign(folder, runs)["cases"]
-    console = Console()
+    console = Console(markup=False)
     bad = any(case["as_expected"] < case["runs"] for case in cases)
     if bad:
         console.print(campaign_table(cases))
@@ -164,7 +165,9 @@ def compare_command(
     second: Annotated[Path, typer.Argument(help="The evaluation to compare with it.")],
 ) -> None:
     """Compare two evaluations of `quadvel eval`."""
-    Console().print(comparison_table({str(path): read_evaluation(path) for path in (first, second)}))
+    Console(markup=False).print(
+        comparison_table({str(path): read_evaluation(path) for path in (first, second)})
+    )
 
 
 def bench_command(
@@ -175,7 +178,10 @@ def bench_command(
         bool,
         typer.Option("--live", help="Start a simulated robot that walks, and measure its nodes instead."),
     ] = False,
-    seconds: Annotated[float, typer.Option(min=1.0, metavar="<s>", help="Duration of --live, s.")] = 60.0,
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=1.0, metavar="<s>", help="Duration of --live, s.", show_default=f"{LIVE_S:g}"),
+    ] = None,
     busy: Annotated[
         int,
         typer.Option(min=0, metavar="<n>", help="Other programs that compute without a pause during --live."),
@@ -183,16 +189,19 @@ def bench_command(
 ) -> None:
     """Measure how fast this machine simulates, infers, communicates and trains.
 
-    It takes some minutes. Run it on an idle machine.
+    It takes up to some minutes. Run it on an idle machine.
     """
+    for option, is_given in (("--seconds", seconds is not None), ("--busy", busy > 0)):
+        if is_given and not live:
+            raise ValueError(f"{option}: belongs to --live, which was not given")
     output_file(out)
-    parts, results = bench.live_parts(seconds, busy) if live else bench.all_parts(), {}
-    messages = Console(stderr=True)
+    parts, results = bench.live_parts(seconds or LIVE_S, busy) if live else bench.all_parts(), {}
+    messages = Console(markup=False, stderr=True)
     with messages.status("") as status:
         for name, part in parts.items():
             status.update(f"measuring: {name}")
             results[name] = part.measure()
     write_json(out, {"schema": bench.SCHEMA, "machine": bench.machine_info(), **results})
-    console = Console()
+    console = Console(markup=False)
     console.print(bench.benchmark_table(results, parts))
     console.print(f"written: {out}")

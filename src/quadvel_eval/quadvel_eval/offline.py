@@ -299,7 +299,7 @@ def _print_results(comparison: TorqueComparison, errors: Mapping[str, Array]) ->
         table.add_row(
             name.removesuffix("_joint"), number_text(rms, ".2f"), number_text(comparison.errors[joint], ".2f")
         )
-    Console().print(table)
+    Console(markup=False).print(table)
     for name, (x, y) in errors.items():
         typer.echo(
             f"offline estimator minus {name}: RMS {number_text(x, '.3f')} m/s in vx, {number_text(y, '.3f')} in vy"

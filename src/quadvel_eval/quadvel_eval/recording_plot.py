@@ -424,6 +424,7 @@ def plot_command(
         figure = draw(run)
         if figure is None:
             typer.echo(f"no {name}.png: its topics were not recorded")
+            (out / f"{name}.png").unlink(missing_ok=True)  # of another recording
             continue
         with atomic_write(out / f"{name}.png") as draft:
             figure.savefig(draft, dpi=110)

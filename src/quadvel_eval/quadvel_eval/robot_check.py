@@ -58,7 +58,7 @@ def check_command(
         raise FileExistsError(f"{numbers}: exists, expected none; --force replaces it")
     found = find_robot(file)
     findings = check_found_robot(found)
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = Console(markup=False, soft_wrap=True, highlight=False)
     console.print(describe_joints(found))
     for finding in findings:
         console.print(f"{'wrong' if finding.fatal else 'note '} {finding.code:13} {finding.text}")

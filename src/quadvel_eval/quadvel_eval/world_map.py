@@ -17,12 +17,16 @@ from matplotlib.patches import Circle, Rectangle
 from numpy.typing import ArrayLike
 from rich.console import Console
 
+from quadvel_description.robot import load_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_recordings.output import output_file
+from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.world import SHIPPED_WORLDS, World
 
 from .report import write_figure
 
 FIGURE_WIDTH_IN = 10.0  # inches
+MIN_MAP_M = 4.0  # height and width of a map, even of a straight path
 FORMATS = (".png", ".svg", ".pdf")
 GROUND_COLOURS = {"grass": "#a9c48f", "gravel": "#cfc7b8", "paved": "#d9dadc"}
 LEADER_COLOUR, OTHER_COLOUR = "#1a9641", "#4575b4"
@@ -44,11 +48,15 @@ def world_command(
       quadvel world campus --out out/campus.png
     """
     loaded = World.load(world)
+    Simulator(
+        SimulatorConfig(robot=load_robot(DEFAULT_ROBOT), world=loaded)
+    )  # refuses an obstacle at the start
     path = output_file(Path(f"out/{loaded.name}.png") if out is None else out)
     if path.suffix not in FORMATS:
         raise ValueError(f"{path}: found the suffix {path.suffix!r}, expected {', '.join(FORMATS)}")
     write_figure(path, draw_world(loaded))
-    Console(soft_wrap=True).print(f"written: {path}")
+    note = "" if loaded.persons else "; it has no person to follow"
+    Console(markup=False, soft_wrap=True).print(f"written: {path}{note}")
 
 
 def draw_world(world: World) -> Figure:
@@ -68,6 +76,9 @@ def draw_world(world: World) -> Figure:
     axes.plot(0.0, 0.0, ">", color="black", markersize=7, label="the robot's start", zorder=6)
     axes.set(xlabel="x, m", ylabel="y, m", title=world.name, aspect="equal")
     axes.autoscale_view()
+    for limits, set_limits in ((axes.get_xlim(), axes.set_xlim), (axes.get_ylim(), axes.set_ylim)):
+        middle, half = float(np.mean(limits)), 0.5 * max(float(np.ptp(limits)), MIN_MAP_M)
+        set_limits(middle - half, middle + half)
     across, up = np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())
     figure.set_size_inches(
         FIGURE_WIDTH_IN, float(np.clip(FIGURE_WIDTH_IN * up / across, 2.5, FIGURE_WIDTH_IN)) + 1.0

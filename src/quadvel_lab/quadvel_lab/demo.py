@@ -108,7 +108,7 @@ def demo_command(
       quadvel demo
     """
     _check_options(context, WALK if what == "walk" else TOUR if tour else FOLLOW)
-    console = Console(soft_wrap=True)
+    console = Console(markup=False, soft_wrap=True)
     if what == "follow":
         folder = output_folder(out or Path("out/tour" if tour else "out/follow"))
         if tour:
@@ -128,14 +128,14 @@ def demo_command(
     for name in DERIVED_FILES:
         (folder / name).unlink(missing_ok=True)
     if problem:
-        console.print(f"[bold red]{problem}")
+        console.print(problem, style="bold red")
         if not lockstep and low_level == "sim":
             console.print(LOCKSTEP_HINT)
     try:
         recording = read_recording(recorded)
         summary = demo_summary.summarise_demo(recording)
     except ValueError as error:
-        console.print(f"no summary of the walk: {error}", markup=False, highlight=False)
+        console.print(f"no summary of the walk: {error}", highlight=False)
         raise typer.Exit(1) from None
     write_json(folder / "summary.json", summary)
     _report(summary, console)
@@ -143,7 +143,7 @@ def demo_command(
     written = [name for name in ("demo.mcap", *DERIVED_FILES) if (folder / name).exists()]
     console.print(f"written to {folder}: {', '.join(written)}")
     if summary["falls"]:
-        console.print(f"[bold red]falls: {summary['falls']}")
+        console.print(f"falls: {summary['falls']}", style="bold red")
     raise typer.Exit(1 if problem or summary["falls"] else 0)
 
 
@@ -198,7 +198,7 @@ def _draw(recording: Recording, folder: Path, video: bool, console: Console) -> 
         console.print(f"no video: no off-screen GL on this machine; sudo apt install {GL_PACKAGES}")
         return
     if not encoder.good:
-        console.print(f"no video: {encoder.text}", markup=False)
+        console.print(f"no video: {encoder.text}")
         return
     console.print("rendering the video of the walk; this may take minutes")
     with console.status("rendering the video"):
@@ -210,4 +210,4 @@ def _draw(recording: Recording, folder: Path, video: bool, console: Console) -> 
         )
     if drawing.returncode:
         reason = (drawing.stderr.strip() or f"exit code {drawing.returncode}").splitlines()[-1]
-        console.print(f"no video: {reason}", markup=False)
+        console.print(f"no video: {reason}")

@@ -28,7 +28,7 @@ from quadvel_bringup.stack import PARAMETERS, absolute_file
 from quadvel_description.kinematics import roll_pitch
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot, load_robot
-from quadvel_description.robot_name import DEFAULT_ROBOT
+from quadvel_description.robot_name import DEFAULT_ROBOT, described_robot
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_eval.report import read_json
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
@@ -63,6 +63,10 @@ RECORDED_TOPICS = {
 }
 
 
+DESCRIPTION_TIMEOUT_S = 1.0  # s
+"""A running robot without a `robot_description` for so long after its first state is taken for the chosen one."""
+
+
 class MotionError(RuntimeError):
     """A motion was aborted; one sentence with the reason."""
 
@@ -77,6 +81,7 @@ class MotionPlayer:
         suspended: Whether the feet are in the air; None for the choice of the motion.
 
     Attributes:
+        robot: The robot of the motion.
         total: Duration of ramp and motion, s.
         elapsed: Time since the first state, s.
     """
@@ -89,7 +94,7 @@ class MotionPlayer:
         suspended: bool | None = None,
     ) -> None:
 
-        self._robot = excitation.robot
+        self.robot = excitation.robot
         self._targets = excitation.targets()
         self._kp = excitation.kp if kp is None else kp
         self._kd = excitation.kd if kd is None else kd
@@ -118,7 +123,7 @@ class MotionPlayer:
         Raises:
             MotionError: The robot left the range of the motion, or states are missing.
         """
-        _check(self._robot, state)
+        _check(self.robot, state)
         if self._begin is None:
             self._begin, self._last = state, state.time
         gap, self._last = state.time - self._last, state.time
@@ -131,7 +136,7 @@ class MotionPlayer:
         if self.is_done:
             return JointCommand.damping(tick=state.tick)
         target, tau = self._current_targets(self._begin.q)
-        target = limit_torque(self._robot, target, state.q, state.dq, self._kp, self._kd, tau)
+        target = limit_torque(self.robot, target, state.q, state.dq, self._kp, self._kd, tau)
         return JointCommand(
             q=target, tau=tau, kp=np.full(12, self._kp), kd=np.full(12, self._kd), tick=state.tick
         )
@@ -151,7 +156,7 @@ def _check(robot: Robot, state: RobotState) -> None:
     """Raise MotionError if tilt or joint angles leave the range of the motions."""
     tilt = np.abs(roll_pitch(state.quaternion)).max()
     if tilt > MAX_TILT_RAD:
-        raise MotionError(f"the trunk tilts by {tilt:.2f} rad, expected at most {MAX_TILT_RAD}")
+        raise MotionError(f"the trunk tilts by {tilt:.3f} rad, expected at most {MAX_TILT_RAD}")
     beyond = np.maximum(robot.lower - state.q, state.q - robot.upper)
     if beyond.max() > JOINT_MARGIN_RAD:
         joint = JOINT_NAMES[int(beyond.argmax())]
@@ -230,7 +235,7 @@ def excite_command(
     On a real robot (--low-level external) let nothing else send low_cmd. For the motions in the
     air, suspend it.
     """
-    console = Console(soft_wrap=True)
+    console = Console(markup=False, soft_wrap=True)
     if after is not None:
         proposals = _read_proposals(after, "" if robot == DEFAULT_ROBOT else robot)
         if motion is not None:
@@ -261,7 +266,7 @@ def excite_command(
     try:
         record_motion(MotionPlayer(excitation, kp, kd, in_the_air), path, nodes, console)
     except MotionError as error:
-        console.print(f"[bold red]{error}")
+        console.print(str(error), style="bold red")
         raise typer.Exit(1) from None
 
 
@@ -357,8 +362,10 @@ class _Session:
 
     def __init__(self, node: Any, recorder_node: Any, player: MotionPlayer, simulated: bool) -> None:
         from rclpy.qos import QoSProfile, ReliabilityPolicy
+        from std_msgs.msg import String
 
         from quadvel_msgs.msg import LowCmd, LowState
+        from quadvel_nodes.robot_view import LATCHED
 
         self._node, self._recorder_node = node, recorder_node
         self._player, self._simulated = player, simulated
@@ -367,12 +374,15 @@ class _Session:
         self._heard: float | None = None  # time of the last state, s
         self._counts: Counter[str] = Counter()
         self._failure: MotionError | None = None
-        self._resting, self._tick = False, 0
+        self._resting, self._tick, self._has_sent = False, 0, False
+        # Time (s) until which a motion waits for the description of a running robot; 0.0: no longer.
+        self._described_until: float | None = 0.0 if simulated else None
         self._publisher = node.create_publisher(LowCmd, "low_cmd", 1)
         # Lockstep must not lose a state; drivers may send states best-effort.
         reliability = ReliabilityPolicy.RELIABLE if simulated else ReliabilityPolicy.BEST_EFFORT
         newest = QoSProfile(depth=1, reliability=reliability)
         node.create_subscription(LowState, "low_state", self._on_state, newest)
+        node.create_subscription(String, "robot_description", self._on_description, LATCHED)
 
     def run(self, draft: Path, group: ProcessGroup, signals: StopSignals, bar: Progress) -> None:
         """Play and record the motion; in any case end with damping on a real robot.
@@ -412,9 +422,9 @@ class _Session:
                 self._rest(playing)
 
     def _rest(self, playing: Any) -> None:
-        """Damp the joints, at once and as the answer to all further states."""
+        """Damp the joints that were moved, at once and as the answer to all further states."""
         self._resting = True
-        if self._heard is not None:
+        if self._has_sent:
             self._send(JointCommand.damping(tick=self._tick), self._node.get_clock().now().to_msg())
         _spin(playing, REST_S)
 
@@ -446,11 +456,26 @@ class _Session:
         if self._heard is not None and now - self._heard > STATE_TIMEOUT_S:
             raise MotionError(f"no message on low_state for {STATE_TIMEOUT_S:g} s")
 
+    def _on_description(self, message: Any) -> None:
+        """Refuse the robot of another motion: its lengths, postures and limits are others."""
+        found, robot = described_robot(message.data), self._player.robot.name
+        self._described_until = 0.0
+        if found not in (None, robot):
+            self._failure = MotionError(
+                f"robot_description is that of {found!r}, expected {robot!r}: play its own motion with --robot {found}"
+            )
+
     def _on_state(self, message: Any) -> None:
-        """Answer a state."""
+        """Answer a state, once it is known which robot this is."""
         self._heard, self._tick = time.monotonic(), message.tick
+        if self._described_until is None:
+            self._described_until = self._heard + DESCRIPTION_TIMEOUT_S
+        if self._heard < self._described_until:
+            return
         answer = self._answer(message)
-        if self._simulated and (self._failure or self._player.is_done):
+        if self._failure and (self._simulated or not self._has_sent):
+            return
+        if self._simulated and self._player.is_done:
             return
         self._send(answer, message.stamp if self._simulated else self._node.get_clock().now().to_msg())
 
@@ -470,3 +495,4 @@ class _Session:
         command = self._message(stamp=stamp)
         write_low_cmd(answer, command)
         self._publisher.publish(command)
+        self._has_sent = True

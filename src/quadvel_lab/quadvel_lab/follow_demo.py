@@ -11,16 +11,20 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import typer
 from rich.console import Console
 from typing_extensions import override
 
 from quadvel_bringup.nodes import process_command, ros_arguments
 from quadvel_bringup.preflight import check_stack
 from quadvel_bringup.stack import Stack
+from quadvel_description.robot import load_robot
 from quadvel_eval.following.recorded import read_following
+from quadvel_eval.following.tour import load_followed_world
 from quadvel_eval.following.tour_report import tour_table, write_tour
 from quadvel_recordings.output import atomic_write
-from quadvel_sim.world import World
+from quadvel_recordings.reading import RecordingError
+from quadvel_sim.simulator import Simulator, SimulatorConfig
 
 from .recorded_run import LOCKSTEP_HINT, RecordedRun
 
@@ -130,15 +134,19 @@ def follow(
     Returns:
         Whether the robot neither fell nor touched anything.
     """
-    stack, loaded = Stack(robot=robot, world=world, use_sim_time=lockstep), World.load(world)
+    stack, loaded = Stack(robot=robot, world=world, use_sim_time=lockstep), load_followed_world(world)
+    Simulator(SimulatorConfig(robot=load_robot(robot), world=loaded))  # refuses an obstacle at the start
     check_stack(stack)
     recorded = folder / "follow.mcap"
     x, y, _ = loaded.laser.position.tolist()
     with atomic_write(recorded) as draft:
         problem = FollowedWalk(draft, stack, (x, y), seconds, view, console).run()
-    if problem:
-        console.print(f"[bold red]{problem}")
-    outcome, moments = read_following(recorded, loaded)
+        if problem:
+            console.print(problem, style="bold red")
+        try:
+            outcome, moments = read_following(draft, loaded)
+        except RecordingError as error:  # files of an earlier run stay
+            raise typer.Exit(1) if problem else error from None
     console.print(tour_table(write_tour(folder, loaded, outcome, moments)))
     console.print(f"written to {folder}: follow.mcap, tour.json, tour.png")
     console.print(f"to watch the run: quadvel view {recorded}", highlight=False)

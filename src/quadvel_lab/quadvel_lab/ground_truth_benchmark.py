@@ -17,7 +17,6 @@ import attrs
 import numpy as np
 import typer
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -69,7 +68,7 @@ def twin_command(
       quadvel twin my_plant.yaml
     """
     files = {file.stem: file for file in map(_plant_file, plants or SHIPPED)}
-    folder, console = output_folder(out), Console(soft_wrap=True)
+    folder, console = output_folder(out), Console(markup=False, soft_wrap=True)
     folders = {name: output_folder(folder / name) for name in files}
     for name, file in files.items():
         for seed, walk in enumerate(WALKS):
@@ -124,7 +123,7 @@ def _walk(file: Path, recording: Path, seed: int, console: Console) -> None:
     with atomic_write(recording) as draft:
         problem = ScriptedWalk(draft, SCRIPT, plant_nodes(file, seed), True, console).run()
         if problem:
-            console.print(f"[bold red]{file.stem} did not walk to the end: {problem}")
+            console.print(f"{file.stem} did not walk to the end: {problem}", style="bold red")
             raise typer.Exit(1)
 
 
@@ -159,7 +158,7 @@ def _identify(folders: Mapping[str, Path], console: Console) -> None:
     for name, code in ended.items():
         if code:
             reason = lines[name][-1] if lines[name] else f"exit code {code}"
-            console.print(f"[bold red]{name} was not identified: {escape(reason)}")
+            console.print(f"{name} was not identified: {reason}", style="bold red")
             raise typer.Exit(code)
 
 

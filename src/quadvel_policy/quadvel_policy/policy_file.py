@@ -38,7 +38,7 @@ def shipped_policy(robot: Robot) -> Path:
         FileNotFoundError: None is shipped for this robot.
     """
     remedy = (
-        "quadvel up, eval and bench take one of your own with --policy FILE; "
+        "quadvel up and eval take one of your own with --policy FILE; "
         "`quadvel up --robot ROBOT --policy none --estimator kalman` only stands"
     )
     return shipped_file(_POLICIES, robot.name, SHIPPED_POLICY.name, "policy", remedy)

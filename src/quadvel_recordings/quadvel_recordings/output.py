@@ -79,7 +79,8 @@ def output_file(path: Path) -> Path:
     Raises:
         OSError: The file is not writable; the message is one sentence.
     """
-    _check_writable(path.parent, Path(path.name), path, "file")
+    if path.name:  # "." and "/" have none
+        _check_writable(path.parent, Path(path.name), path, "file")
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder, expected a file to write")
     if path.exists() and not path.is_file():

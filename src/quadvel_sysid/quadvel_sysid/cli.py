@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import attrs
 import typer
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from threadpoolctl import threadpool_limits
 from typer.core import TyperCommand
@@ -180,7 +179,7 @@ def identify(
     Other files in the folder are kept. Ctrl-C leaves the folder unchanged. Exit code 3: the result is not that of
     a PD-controlled joint, or another model predicts better; actuator.yaml is then not written without --force.
     """
-    messages = Console(stderr=True)
+    messages = Console(markup=False, stderr=True)
     try:
         output_folder(out)
         named = [path.resolve() for path in (*logs, *(holdout or []))]
@@ -248,15 +247,15 @@ def _write(found: Identification, out: Path, force: bool, messages: Console) -> 
     from .report.summary_text import leave_one_out_text
 
     names = write_report(found, out, force)
-    console = Console()
-    console.print(escape(str(found.report["decision"])), soft_wrap=True, highlight=False)
+    console = Console(markup=False)
+    console.print(str(found.report["decision"]), soft_wrap=True, highlight=False)
     console.print(error_line(found.report), soft_wrap=True, highlight=False)
     if "replay" in found.report:
         console.print(replay_line(found.report["replay"]), soft_wrap=True, highlight=False)
     if "leave_one_out" in found.report:
         console.print(leave_one_out_text(found.report["leave_one_out"]), soft_wrap=True, highlight=False)
     for text in found.report["warnings"]:
-        messages.print(escape(f"warning: {text}"), style=STYLE["warning"], soft_wrap=True, highlight=False)
+        messages.print(f"warning: {text}", style=STYLE["warning"], soft_wrap=True, highlight=False)
     console.print(f"written: {out}/{', '.join(names)}", soft_wrap=True, highlight=False)
 
 
@@ -309,10 +308,10 @@ def print_findings(checked: CheckedLog, messages: Console) -> None:
         checked: The log with its findings.
         messages: Console to print to.
     """
-    messages.print(escape(checked.log.name), style="bold", soft_wrap=True, highlight=False)
+    messages.print(checked.log.name, style="bold", soft_wrap=True, highlight=False)
     for finding in checked.findings:
         line = f"  {finding.kind:8} {finding.text}"
-        messages.print(escape(line), style=STYLE[finding.kind], soft_wrap=True, highlight=False)
+        messages.print(line, style=STYLE[finding.kind], soft_wrap=True, highlight=False)
 
 
 def main() -> None:

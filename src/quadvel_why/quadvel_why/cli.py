@@ -142,5 +142,7 @@ def _answer(run: Run, recording: Path, policy: Path | None, out: Path) -> bool:
         with atomic_write(out / "why.png") as draft:
             picture(diagnosis.finding).savefig(draft, dpi=110, format="png")
         written.append("why.png")
+    else:
+        (out / "why.png").unlink(missing_ok=True)  # of another recording
     typer.echo(f"written: {out}/{', '.join(written)}")
     return diagnosis.finding is not None

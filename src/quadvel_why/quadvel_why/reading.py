@@ -77,6 +77,10 @@ def read_run(
     is_recording = path.suffix in RECORDINGS or path.is_dir()
     types = topics(path) if is_recording else {}
     if STATE in types.values():
+        if topics_of_log is not None and topics_of_log != Topics():
+            raise RecordingError(
+                f"{path}: holds the topics of this stack, expected no --state-topic and no --command-topic"
+            )
         if gains is not None:
             warn_of_unused_gains(path)
         named = described_robot(recorded_description(path))

@@ -39,7 +39,7 @@ def following_command(
     table = Table(f"simulated, {runs} each", *HEADS.values())
     for name, row in found.items():
         table.add_row(name, *(number_text(row[head], ".2f") for head in HEADS))
-    Console().print(table)
+    Console(markup=False).print(table)
     with atomic_write(out / "following.json") as draft:
         draft.write_text(json.dumps(found, indent=1))
     print(f"written: {out}/following.json")

@@ -94,6 +94,24 @@ class TourSample:
     gap: float
 
 
+def load_followed_world(source: str) -> World:
+    """Load a world with a person to follow.
+
+    Args:
+        source: Name of a shipped world, or path of a file.
+
+    Returns:
+        The world.
+
+    Raises:
+        ValueError: The file cannot be read, is wrong, or has no person.
+    """
+    world = World.load(source)
+    if not world.persons:
+        raise ValueError(f"world {source}: persons: found none, expected a person to follow")
+    return world
+
+
 class Tour:
     """Walk behind a person through a world; iterate over `samples` once.
 
@@ -111,7 +129,7 @@ class Tour:
     """
 
     def __init__(self, setup: TourSetup) -> None:
-        self.setup, self.world = setup, World.load(setup.world)
+        self.setup, self.world = setup, load_followed_world(setup.world)
         robot = load_robot(setup.robot)
         self.simulator = Simulator(
             SimulatorConfig(robot=robot, world=self.world, seed=setup.seed, **setup.plant)

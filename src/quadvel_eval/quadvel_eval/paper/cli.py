@@ -90,7 +90,7 @@ def paper_command(
 
         done = run_sections(study, sections, folder, again, cluster, show_progress)
     kept = [section.name for section in sections if section.name not in done]
-    console = Console()
+    console = Console(markup=False)
     if kept:
         console.print(f"unchanged: {', '.join(kept)}")
     console.print(f"written: {folder}/{PAGE_FILE}")

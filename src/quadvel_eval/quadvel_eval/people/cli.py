@@ -49,8 +49,10 @@ def people_command(
     ] = SHIPPED_MODEL,
 ) -> None:
     """Measure how well people are found and tracked in laser scans, real and simulated."""
-    detector, console = LegDetector(model), Console()
+    detector, console = LegDetector(model), Console(markup=False)
     output_folder(out)
+    if scans is None and not runs:
+        raise ValueError("--runs: found 0 without --scans, expected scenes or scans to measure")
     found: dict[str, Figures] = {}
     if scans is not None:
         found["scans"] = measure_files(scans, detector)
