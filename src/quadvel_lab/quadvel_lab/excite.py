@@ -223,9 +223,9 @@ def excite_command(
     chirp         fast swings in the air         steps  steps of all sizes in the air
     creep         slow motion in the air         solo   one joint at a time in the air
 
-    On the ground the gains are those of standing up (--kp 150 --kd 4), with feed-forward torque for
-    the weight: with the policy's gains (--kp 30 --kd 0.5), which the motions in the air use, the
-    robot tips over. The recording contains gains and torque.
+    Motions on the ground use the gains of standing up (--kp 150 --kd 4) and feed-forward torque for
+    the weight, because the robot tips over with those of the policy. Motions in the air use the
+    policy's (--kp 30 --kd 0.5). The recording contains gains and torque.
 
     \b
     For example:

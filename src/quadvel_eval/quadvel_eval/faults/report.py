@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from quadvel_nodes.number_text import counted
 from quadvel_recordings.output import atomic_write
 
 from ..report import write_json
@@ -80,7 +81,8 @@ def campaign_summary(entries: Entries) -> str:
     worst = {name: max(entry[name] for entry in entries) for name in ("torque", "speed", "beyond")}
     kinds = {entry["case"].rsplit(" ", 1)[0] for entry in entries}
     return (
-        f"{len(kinds)} kinds of fault in {len(entries)} cases, {runs} runs, {good} as expected; largest torque "
+        f"{counted(len(kinds), 'kind')} of fault in {counted(len(entries), 'case')}, {counted(runs, 'run')}, {good} as "
+        f"expected; largest torque "
         f"{worst['torque']:.2f} and speed under drive {worst['speed']:.2f} of the drive's limit, "
         f"{worst['beyond']:.2f} rad into a mechanical stop"
     )

@@ -48,7 +48,7 @@ def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
                     bar.update(task, completed=tour.walked, description=sample.words)
                 if not console.is_terminal and tour.walked >= next_report:
                     console.print(f"{tour.walked:.0f} of {setup.path_length:.0f} m: {sample.words}")
-                    next_report += setup.path_length / MAX_PROGRESS_LINES
+                    next_report += max(setup.path_length / MAX_PROGRESS_LINES, 1.0)  # m
         except KeyboardInterrupt:
             is_stopped = True
     if samples:
