@@ -246,8 +246,6 @@ class DaggerRun:
         self.student.load_state_dict(state["average"])
         self.average.load_state_dict(state["average"])
         self.recall.load_state_dict(state["recall"])
-        # Without the moments of its past, Adam's first steps go as far along noise as along signal.
-        self.optimiser.load_state_dict(state["optimiser"])
 
     def _learning(self) -> torch.nn.ModuleList:
         """Networks that learn."""
