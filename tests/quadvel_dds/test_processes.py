@@ -118,7 +118,9 @@ def test_discovery_stays_on_this_host_unless_asked_otherwise(monkeypatch: pytest
     assert "localhost" not in wire.domain_configuration()
     assert "NetworkInterface" not in wire.domain_configuration()
     assert '<Peer address="192.168.123.10" pruneDelay="inf"/>' in wire.domain_configuration()
-    for unknown in ("no.such.host.invalid", 'a"/><Evil', "127.0.0.1;no.such.host.invalid"):
+    monkeypatch.setenv("ROS_STATIC_PEERS", "127.0.0.1:7410; localhost;")
+    assert '<Peer address="127.0.0.1:7410" pruneDelay="inf"/>' in wire.domain_configuration()
+    for unknown in ("no.such.host.invalid", 'a"/><Evil', "127.0.0.1;no.such.host.invalid", "::1", ":7410"):
         monkeypatch.setenv("ROS_STATIC_PEERS", unknown)
         with pytest.raises(ValueError, match="ROS_STATIC_PEERS: found "):
             wire.domain_configuration()

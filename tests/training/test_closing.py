@@ -72,8 +72,8 @@ def test_steps_whose_files_are_there_are_not_run_again(tmp_path, monkeypatch, ca
     assert str(out / "walk.npz") in ran[1]
     (out / "tuned" / "policy.onnx").unlink()
     closing.close_the_loop(*given(out))
-    assert ran[4:] == [ran[2]]
-    assert capsys.readouterr().out.count("kept: ") == 3
+    assert ran[4:] == ran[2:4]  # the comparison is that of the new policy
+    assert capsys.readouterr().out.count("kept: ") == 2
 
 
 def test_a_step_that_fails_ends_it(tmp_path, monkeypatch):

@@ -76,15 +76,15 @@ def domain_configuration() -> str:
 
 
 def _static_peers() -> list[str]:
-    """Return the hosts of ROS_STATIC_PEERS; Cyclone would abort the process for one that is unknown."""
+    """Return the hosts of ROS_STATIC_PEERS, with ports if given; Cyclone aborts the process for an unknown one."""
     peers = [peer.strip() for peer in os.environ.get("ROS_STATIC_PEERS", "").split(";") if peer.strip()]
     for peer in peers:
         try:
-            socket.getaddrinfo(peer, None)
+            socket.getaddrinfo(peer.partition(":")[0], None, socket.AF_INET)  # Cyclone uses IPv4 here
         except (OSError, UnicodeError):
             raise ValueError(
                 f"ROS_STATIC_PEERS: found {peer!r}, which this computer cannot resolve, expected names or "
-                "addresses of hosts, separated by ;"
+                "IPv4 addresses of hosts, separated by ;"
             ) from None
     return peers
 

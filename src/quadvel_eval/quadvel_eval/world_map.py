@@ -26,7 +26,7 @@ from quadvel_sim.world import SHIPPED_WORLDS, World
 from .report import write_figure
 
 FIGURE_WIDTH_IN = 10.0  # inches
-MIN_MAP_M = 4.0  # height and width of a map, even of a straight path
+MIN_MAP_M = 4.0  # smallest height and width of a map, for a straight path
 FORMATS = (".png", ".svg", ".pdf")
 GROUND_COLOURS = {"grass": "#a9c48f", "gravel": "#cfc7b8", "paved": "#d9dadc"}
 LEADER_COLOUR, OTHER_COLOUR = "#1a9641", "#4575b4"

@@ -64,7 +64,7 @@ RECORDED_TOPICS = {
 
 
 DESCRIPTION_TIMEOUT_S = 1.0  # s
-"""A running robot without a `robot_description` for so long after its first state is taken for the chosen one."""
+"""A running robot that sends no `robot_description` for so long after its first state counts as the chosen one."""
 
 
 class MotionError(RuntimeError):
@@ -375,7 +375,8 @@ class _Session:
         self._counts: Counter[str] = Counter()
         self._failure: MotionError | None = None
         self._resting, self._tick, self._has_sent = False, 0, False
-        # Time (s) until which a motion waits for the description of a running robot; 0.0: no longer.
+        # Time (s) until which a motion waits for the description of a running robot; None: no state was
+        # heard yet; 0.0: it waits no longer.
         self._described_until: float | None = 0.0 if simulated else None
         self._publisher = node.create_publisher(LowCmd, "low_cmd", 1)
         # Lockstep must not lose a state; drivers may send states best-effort.
@@ -473,7 +474,7 @@ class _Session:
         if self._heard < self._described_until:
             return
         answer = self._answer(message)
-        if self._failure and (self._simulated or not self._has_sent):
+        if (self._failure or self._resting) and (self._simulated or not self._has_sent):
             return
         if self._simulated and self._player.is_done:
             return

@@ -146,7 +146,9 @@ def follow(
         try:
             outcome, moments = read_following(draft, loaded)
         except RecordingError as error:  # files of an earlier run stay
-            raise typer.Exit(1) if problem else error from None
+            if problem:
+                raise typer.Exit(1) from None
+            raise RecordingError(str(error).replace(str(draft), str(recorded))) from None
     console.print(tour_table(write_tour(folder, loaded, outcome, moments)))
     console.print(f"written to {folder}: follow.mcap, tour.json, tour.png")
     console.print(f"to watch the run: quadvel view {recorded}", highlight=False)

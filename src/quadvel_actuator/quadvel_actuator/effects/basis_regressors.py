@@ -4,8 +4,8 @@ A regressor is a weighted sum of basis functions of one signal (`shapes` has the
 multiplied by the direction of motion, the speed or the torque (`MULTIPLIERS`). Its torque is clipped
 to the largest value that it had on the fitted rows. Like effects, regressors run over whole series
 and step by step. In a parameter file all regressors form one effect, `learned_residual`, whose
-parameter `terms` lists them. `quadvel_sysid.search.regressor_library` lists which signals,
-multipliers and shapes the identification tries.
+parameter `terms` lists them. The identification, a package of its own, lists which signals,
+multipliers and shapes it tries (`regressor_library`).
 
 Signals have the names of the report: `q`, `dq`, `ddq`, `q_des`, `error` (q_des - q), `t`, `tau`
 (prediction without regressors), and `FR_thigh_joint/q` for those of another joint.

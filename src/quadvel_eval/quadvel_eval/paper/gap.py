@@ -149,12 +149,12 @@ class Gap(Section):
     name: ClassVar[str] = "gap"
     title: ClassVar[str] = "The gap: drives that hold what the model lacks"
     method: ClassVar[str] = (
-        "Ten commands of 6 s on the plant of the actuator model and on five others. Four hold, in addition, dry friction "
+        "Ten commands of 6 s on the plant of the actuator model and on five others. Four have, in addition, dry friction "
         "(1.2 N m, 1.8 at rest), a torque limit of 24 N m that falls to nothing at 12 rad/s in the direction of motion, a "
-        "torque that lags by 5 ms, and a backlash of ±15 mrad. The fifth has the drives of the other shipped robot. The "
-        "shipped policy's training drew torque limits, and none of the others. Errors are those of the robots that did not "
-        "fall; the cut of the error is against the first policy, on the walks that neither fell on. The paper's own gap is that "
-        "between simulation and robot: RL-PD fell 3 times there, the EAM policies never."
+        "torque that lags (first order, 5 ms), and a backlash of ±15 mrad. The fifth has the drives of the other shipped "
+        "robot. The shipped policy's training knew none of them; its teacher's drew wider torque limits. Errors are those of "
+        "the robots that did not fall; the cut of the error is against the first policy, on the walks that neither fell on. "
+        "The paper's own gap is that between simulation and robot: RL-PD fell 3 times there, the EAM policies never."
     )
     commands: tuple[Command, ...] = COMMANDS
 
