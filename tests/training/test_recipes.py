@@ -11,8 +11,7 @@ import pytest
 
 pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-core[train]'")
 
-from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
-from quadvel_description.quadruped import JOINT_NAMES
+from quadvel_actuator import ActuatorModel
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_training import loop, recipe, stages
@@ -84,17 +83,6 @@ def test_plain_pd_joints_have_gains_and_delays_of_their_own(ablation):
         assert high - 0.05 * (high - low) < drawn.max() <= high
     assert np.ptp(joints.kp_scale, axis=1).max() == 0.0
     assert abs(np.corrcoef(joints.kp_scale[:, 0], joints.kd_scale[:, 0])[0, 1]) < 0.2
-
-
-def test_identified_effects_are_drawn_near_their_values(tmp_path):
-    intervals = {"c": [1.15, 1.25], "c_s": [0.0, 18.3], "v_s": [[0.1, 0.4]] * 12}
-    values = {"c": 1.2, "c_s": 2.0, "v_s": [0.3] * 12, "v_0": 0.05}
-    effect = Effect("stribeck_friction", JOINT_NAMES, values, {}, intervals)
-    attrs.evolve(ActuatorParameters.of(ALIENGO), effects=(effect,)).save(tmp_path / "actuator.yaml")
-    narrow = load_actuator(ALIENGO, str(tmp_path / "actuator.yaml")).effects[0].intervals
-    np.testing.assert_allclose(narrow["c"], [1.15, 1.25])
-    np.testing.assert_allclose(narrow["c_s"], [1.5, 2.5])
-    np.testing.assert_allclose(narrow["v_s"], [[0.225, 0.375]] * 12)
 
 
 @pytest.mark.parametrize(

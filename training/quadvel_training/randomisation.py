@@ -65,13 +65,6 @@ def rated_drives(robot: Robot) -> ActuatorParameters:
     )
 
 
-MAX_DRAWN_SHARE = 0.25
-"""Largest difference of a drawn effect parameter to the identified value, relative to it.
-
-Where a log does not separate two parameters of an effect, their intervals are wide, and the error of
-one is made up for by the other. Drawn one by one from these intervals, they give effects that the log
-excludes: friction at rest of 18 N m where the log has 2.
-"""
 ACTUATORS = {
     "eam": ActuatorParameters.of,
     "limited": limited_drives,
@@ -264,30 +257,12 @@ def load_actuator(robot: Robot, name: str) -> ActuatorParameters:
     Args:
         robot: The robot.
         name: `eam` (the robot's file), `limited` or `rated` (with speed-torque curves), `ideal` (PD law),
-            or an actuator file, whose intervals are limited to `MAX_DRAWN_SHARE`.
+            or an actuator file.
 
     Returns:
         Their parameters.
     """
-    if name in ACTUATORS:
-        return ACTUATORS[name](robot)
-    found = ActuatorParameters.load(robot, name)
-    return attrs.evolve(found, effects=tuple(_narrowed(effect) for effect in found.effects))
-
-
-def _narrowed(effect: Effect) -> Effect:
-    """Limit the intervals of an identified effect to `MAX_DRAWN_SHARE` about its values."""
-    intervals = {}
-    for name, interval in effect.intervals.items():
-        bounds, value = np.asarray(interval, float), np.asarray(effect.parameters[name], float)
-        if bounds.ndim == 1:  # one draw for all joints
-            value = value.mean()
-        reach = MAX_DRAWN_SHARE * np.abs(value)
-        limited = np.stack(
-            [np.maximum(bounds[..., 0], value - reach), np.minimum(bounds[..., 1], value + reach)], -1
-        )
-        intervals[name] = np.sort(limited, axis=-1).tolist()
-    return attrs.evolve(effect, intervals=intervals)
+    return ACTUATORS[name](robot) if name in ACTUATORS else ActuatorParameters.load(robot, name)
 
 
 def sample_actuators(
