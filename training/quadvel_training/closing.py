@@ -137,7 +137,7 @@ def fill_steps(
 def close_the_loop(
     plant: str, policy: Path, checkpoint: Path, teacher: Path, minutes: float, out: Path
 ) -> str:
-    """Run the steps whose files are missing; each command is printed before it runs.
+    """Run the steps whose files are missing, and the comparison; each command is printed before it runs.
 
     At the end the errors of both policies are printed, on the plant and on that of the robot's own
     actuator model.
@@ -157,13 +157,15 @@ def close_the_loop(
         subprocess.CalledProcessError: a command failed.
     """
     out.mkdir(parents=True, exist_ok=True)
-    for file, arguments in (all_of_them := fill_steps(plant, policy, checkpoint, teacher, minutes, out)):
-        if file.exists() and file != all_of_them[-1][0]:  # `paper` itself keeps what is up to date
+    steps = fill_steps(plant, policy, checkpoint, teacher, minutes, out)
+    page, _ = steps[-1]
+    for file, arguments in steps:
+        if file.exists() and file != page:  # `paper` itself keeps what is up to date
             print(f"kept: {file}", flush=True)
         else:
             print("$ python", shlex.join(arguments), flush=True)
             subprocess.run([sys.executable, *arguments], check=True)
-    records = read_records(all_of_them[-1][0].with_name("gap.csv"))
+    records = read_records(page.with_name("gap.csv"))
     compared = [Comparison.of(records, name) for name in (plant, TRAINED)]
     print(*compared, f"written: {out}", sep="\n")
     return refusal(*compared)
