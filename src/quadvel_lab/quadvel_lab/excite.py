@@ -28,7 +28,7 @@ from quadvel_bringup.stack import PARAMETERS, absolute_file
 from quadvel_description.kinematics import roll_pitch
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot, load_robot
-from quadvel_description.robot_name import DEFAULT_ROBOT, described_robot
+from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_eval.report import read_json
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
@@ -375,9 +375,8 @@ class _Session:
         self._counts: Counter[str] = Counter()
         self._failure: MotionError | None = None
         self._resting, self._tick, self._has_sent = False, 0, False
-        # Time (s) until which a motion waits for the description of a running robot; None: no state was
-        # heard yet; 0.0: it waits no longer.
-        self._described_until: float | None = 0.0 if simulated else None
+        self._is_described = simulated  # a running robot says which one it is, or is silent about it
+        self._first_heard = float("inf")  # time of the first state, s
         self._publisher = node.create_publisher(LowCmd, "low_cmd", 1)
         # Lockstep must not lose a state; drivers may send states best-effort.
         reliability = ReliabilityPolicy.RELIABLE if simulated else ReliabilityPolicy.BEST_EFFORT
@@ -459,19 +458,20 @@ class _Session:
 
     def _on_description(self, message: Any) -> None:
         """Refuse the robot of another motion: its lengths, postures and limits are others."""
-        found, robot = described_robot(message.data), self._player.robot.name
-        self._described_until = 0.0
-        if found not in (None, robot):
+        from quadvel_nodes.robot_check import other_robot
+
+        self._is_described = True
+        if found := other_robot(message, self._player.robot):
             self._failure = MotionError(
-                f"robot_description is that of {found!r}, expected {robot!r}: play its own motion with --robot {found}"
+                f"robot_description is that of {found!r}, expected {self._player.robot.name!r}: play its own "
+                f"motion with --robot {found}"
             )
 
     def _on_state(self, message: Any) -> None:
         """Answer a state, once it is known which robot this is."""
         self._heard, self._tick = time.monotonic(), message.tick
-        if self._described_until is None:
-            self._described_until = self._heard + DESCRIPTION_TIMEOUT_S
-        if self._heard < self._described_until:
+        self._first_heard = min(self._first_heard, self._heard)
+        if not self._is_described and self._heard < self._first_heard + DESCRIPTION_TIMEOUT_S:
             return
         answer = self._answer(message)
         if (self._failure or self._resting) and (self._simulated or not self._has_sent):

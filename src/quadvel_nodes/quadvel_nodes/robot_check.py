@@ -30,11 +30,23 @@ class RobotCheck:
         node.create_subscription(String, "robot_description", self._on_description, LATCHED)
 
     def _on_description(self, message: String) -> None:
-        found = described_robot(message.data)
-        if found is None or found == self._robot.name:
-            return
-        request_exit(
-            self._node,
-            f"{self._node.get_name()}: robot_description is that of {found!r}, expected "
-            f"{self._robot.name!r}: start it with -p robot:={found}",
-        )
+        if found := other_robot(message, self._robot):
+            request_exit(
+                self._node,
+                f"{self._node.get_name()}: robot_description is that of {found!r}, expected "
+                f"{self._robot.name!r}: start it with -p robot:={found}",
+            )
+
+
+def other_robot(description: String, robot: Robot) -> str:
+    """Return the robot that a description names, if it is another one.
+
+    Args:
+        description: Message of `robot_description`.
+        robot: The expected robot.
+
+    Returns:
+        Its name; "" for the expected robot or none.
+    """
+    found = described_robot(description.data)
+    return "" if found in (None, robot.name) else str(found)
