@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import attrs
 import numpy as np
 import onnx
 import pytest
@@ -169,6 +170,17 @@ def walked(policy: ImportedPolicy, inputs: list[ModeInput]) -> list[JointCommand
     mode = Walk(policy, blend_time=0.0)
     mode.enter(inputs[0])
     return [mode.tick(one) for one in inputs]
+
+
+def test_the_command_of_an_imported_policy_is_not_trimmed(tmp_path: Path) -> None:
+    size = 3 * 3 + 3 + 3 + 2 * 12 + 12 + 2 * 12
+    write_network(tmp_path / "policy.onnx", size, outputs=3)
+    out = tmp_path / "out.onnx"
+    import_policy(GO2, tmp_path / "policy.onnx", write_yaml(tmp_path / "deploy.yaml", DEPLOY), out)
+    constant = [attrs.evolve(one, command=np.array([0.5, 0.0, 0.0, 0.0])) for one in some_walk(600)]
+    untrimmed, trimmed = Walk(ImportedPolicy(GO2, out), 0.0), Walk(ImportedPolicy(GO2, out), 0.0, 0.1)
+    for one in constant:
+        np.testing.assert_array_equal(trimmed.tick(one).q, untrimmed.tick(one).q)
 
 
 def gravity(state: RobotState) -> list[float]:

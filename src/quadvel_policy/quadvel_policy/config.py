@@ -17,6 +17,9 @@ from .guard import FALL_TIME_S, GuardConfig
 MAX_STIFFNESS, MAX_DAMPING = 1000.0, 50.0
 """N m/rad and N m s/rad; larger gains make the legs oscillate."""
 
+MAX_TRIM = 0.3
+"""m/s and rad/s; a larger steady error is no small difference of drives or ground."""
+
 
 @attrs.frozen(kw_only=True)
 class SupervisorConfig:
@@ -38,6 +41,12 @@ class SupervisorConfig:
     settle_time: float = positive(0.3, "from walking back to the nominal posture, s", at_most=60.0)
     lie_down_time: float = positive(1.0, "from standing to the lying posture, s", at_most=60.0)
     blend_time: float = positive(0.15, "over which the policy's torques fade in, s", at_most=FALL_TIME_S)
+    max_velocity_trim: float = field(
+        0.1,
+        "largest change of a constant velocity command that removes a steady error, m/s and rad/s; 0: none",
+        at_least=0.0,
+        at_most=MAX_TRIM,
+    )
     reset_gap: float = positive(
         0.02, "time without a state after which the policy's memory is reset, s", at_most=FALL_TIME_S
     )

@@ -21,6 +21,7 @@ from quadvel_description.state import JointCommand, RobotState
 
 from .imported.metadata import ImportedMetadata
 from .observation import JOINTS, PolicyMetadata
+from .velocity_trim import VelocityTrim
 
 LEAN_FILTER_S = 1.0
 """Time constant of the lean; a shorter one amplifies the sway of a standing robot (decision 50)."""
@@ -271,22 +272,25 @@ class Walk:
     """Runs the policy; its torques fade in over `blend_time` after the entry.
 
     A policy with a lower rate than the control loop runs at some ticks; its targets are held at the
-    others.
+    others. Constant commands are trimmed (`velocity_trim`), but not those of an imported policy: the
+    velocity estimator was not trained on its gait.
 
     Attributes:
         inference_seconds: Duration of the last network step, s; NaN before the first.
     """
 
-    def __init__(self, policy: Policy, blend_time: float) -> None:
+    def __init__(self, policy: Policy, blend_time: float, max_trim: float = 0.0) -> None:
         """Create the mode.
 
         Args:
             policy: The policy.
             blend_time: Duration of the fade-in, s.
+            max_trim: Largest trim of each axis of the velocity command, m/s and rad/s.
         """
         self._policy = policy
         self._blend_time = blend_time
         meta = policy.metadata
+        self._trim = VelocityTrim(meta.limits, max_trim if isinstance(meta, PolicyMetadata) else 0.0)
         self._observer, self._action = meta.observer, meta.action
         self._ticks_per_step = meta.ticks_per_step
         self._kp, self._kd = np.array(meta.kp), np.array(meta.kd)
@@ -295,8 +299,9 @@ class Walk:
         self.reset()
 
     def reset(self) -> None:
-        """Reset the recurrent state, the past observations and the previous action of the policy."""
+        """Reset the policy's recurrent state, past observations and previous action, and the trim."""
         self._policy.reset()
+        self._trim.reset()
         self._observer.reset()
         self._previous_action = np.zeros(JOINTS, np.float32)
         self._held_ticks = self._ticks_per_step  # the next tick runs the network
@@ -323,10 +328,10 @@ class Walk:
             FloatingPointError: The output of the policy is not finite.
         """
         assert inputs.velocity is not None  # the supervisor does not walk without one
+        state, velocity = inputs.state, inputs.velocity
+        command = self._trim.apply(inputs.command, velocity, float(state.angular_velocity[2]))
         if self._held_ticks == self._ticks_per_step:
-            observation = self._observer.observe(
-                inputs.state, inputs.velocity, inputs.command, self._previous_action
-            )
+            observation = self._observer.observe(state, velocity, command, self._previous_action)
             start = time.perf_counter()
             self._previous_action = self._policy.step(observation)
             self.inference_seconds = time.perf_counter() - start

@@ -122,7 +122,8 @@ class Supervisor:
             "lie_down": [(c.lie_down_time, robot.lie_q)],
         }
         self._postures = {mode: Posture(robot, path, c.stand_kp, c.stand_kd) for mode, path in paths.items()}
-        self._walk, damping = policy and Walk(policy, c.blend_time), Damping(c.damping_kd)
+        self._walk = policy and Walk(policy, c.blend_time, c.max_velocity_trim)
+        damping = Damping(c.damping_kd)
         self._modes: dict[str, Mode] = {**self._postures, "passive": damping, "fault": damping}
         if self._walk:
             self._modes["walk"] = self._walk

@@ -20,6 +20,7 @@ from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.observation import JOINTS, build_observation
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import MIN_STEPPING_SPEED, STANCE_COMMAND
+from quadvel_policy.velocity_trim import VelocityTrim
 
 from .run import SAME_INSTANT_S, Run
 
@@ -141,7 +142,7 @@ class PolicyReplay:
     def __init__(self, run: Run, policy: PolicyFile) -> None:
         self._run, self.policy = run, policy
         self.ticks = self._policy_ticks()
-        self._prepared: dict[int, NDArray[np.float32]] = {}
+        self._prepared: dict[tuple[int, float], NDArray[np.float32]] = {}
 
     @property
     def is_usable(self) -> bool:
@@ -214,6 +215,13 @@ class PolicyReplay:
         return self.run(Variant("as the file says"))
 
     @cached_property
+    def _max_trim(self) -> float:
+        """Bound of the controller's trim, m/s and rad/s: 0 if the commands show that it had none."""
+        usual, whole = SupervisorConfig().max_velocity_trim, Variant("the whole walk")
+        trimmed, untrimmed = (self._replay(whole, None, most).error for most in (usual, 0.0))
+        return 0.0 if untrimmed < trimmed else usual
+
+    @cached_property
     def _fault_time(self) -> float:
         """Time of the first fault that was reported since the walk began, s; infinity without one."""
         modes, began = self._run.modes, self._run.commands.time[self.ticks[0]]
@@ -241,7 +249,7 @@ class PolicyReplay:
             | (power > NEAR_LIMIT * limits.max_power)
         )
 
-    def _observations(self, late: int) -> NDArray[np.float32]:
+    def _observations(self, late: int, max_trim: float) -> NDArray[np.float32]:
         """Observations of all ticks without the previous actions, (k, 48)."""
         run = self._run
         assert run.imu is not None
@@ -250,14 +258,17 @@ class PolicyReplay:
         velocity = run.estimate.value[self._velocity_rows]
         command = self._velocity_commands.copy()
         command[np.linalg.norm(velocity, axis=1) > MIN_STEPPING_SPEED, 3] = 0.0
+        turning = run.imu.angular_velocity[rows]
+        trim = VelocityTrim(self.policy.metadata.limits, max_trim)
+        trimmed = [trim.apply(*now) for now in zip(command, velocity, turning[:, 2].tolist(), strict=True)]
         return build_observation(
             self.policy.metadata.observation,
-            command=command,
+            command=trimmed,
             quaternion=run.imu.quaternion[rows],
             q=run.q[rows],
             dq=run.dq[rows],
             linear_velocity=velocity,
-            angular_velocity=run.imu.angular_velocity[rows],
+            angular_velocity=turning,
             previous_action=np.zeros((len(rows), JOINTS)),
         )
 
@@ -271,10 +282,13 @@ class PolicyReplay:
         Returns:
             The replay.
         """
-        meta, ticks = self.policy.metadata, self.ticks[:most]
-        if variant.late not in self._prepared:
-            self._prepared[variant.late] = self._observations(variant.late)
-        observations = self._prepared[variant.late]
+        return self._replay(variant, most, self._max_trim)
+
+    def _replay(self, variant: Variant, most: int | None, max_trim: float) -> Replay:
+        meta, ticks, prepared = self.policy.metadata, self.ticks[:most], (variant.late, max_trim)
+        if prepared not in self._prepared:
+            self._prepared[prepared] = self._observations(*prepared)
+        observations = self._prepared[prepared]
         term = next(term for term in meta.observation.terms if term.name == "previous_action")
         own = term_slice(meta.observation, term.name)
         bound = np.inf if term.clip is None else term.clip

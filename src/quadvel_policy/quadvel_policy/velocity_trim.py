@@ -1,0 +1,94 @@
+"""Trim of a constant velocity command, so that the mean of the estimated velocity reaches it.
+
+A policy walks a little slower, faster or sideways on drives and ground that its training did not have.
+The trim removes that steady error: it adds the integral of the error to the command. Knows no ROS.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from quadvel_description.arrays import Array
+
+from .observation import RATE_HZ, VelocityCommandLimits
+
+SETTLING_S = 0.5
+"""Time constant after which the robot counts as having followed a change of the command."""
+SETTLED = 0.03
+"""m/s and rad/s, largest distance of a command from its low-pass at which the trim integrates."""
+INTEGRATION_S = 1.0
+"""Time constant of the integral, and of its decay while the command changes; twice SETTLING_S, so that the
+loop through the robot does not oscillate.
+"""
+TICK_S = 1.0 / RATE_HZ
+
+Axes = tuple[float, float, float]
+ZERO: Axes = (0.0, 0.0, 0.0)
+
+
+class VelocityTrim:
+    """Adds a bounded integral of the velocity error to the command of a policy.
+
+    With the command c and its low-pass s (SETTLING_S), the measured velocity v and the trim i, all of
+    (vx, vy, wz):
+
+        i' = (c - v) / INTEGRATION_S  where |c - s| <= SETTLED on all axes, |i| <= bound
+        i' = -i / INTEGRATION_S       elsewhere: the command changes
+        i  = 0                        in stance
+
+    The policy gets c + i, within its limits.
+    """
+
+    def __init__(self, limits: VelocityCommandLimits, bound: float) -> None:
+        """Create a trim of zero.
+
+        Args:
+            limits: Velocities that the policy can follow.
+            bound: Largest trim of each axis, m/s and rad/s; 0: commands are not changed.
+        """
+        self._limits, self._bound = limits, bound
+        self._settling_share = 1.0 - math.exp(-TICK_S / SETTLING_S)
+        self._decay = math.exp(-TICK_S / INTEGRATION_S)
+        self.reset()
+
+    def reset(self) -> None:
+        """Set the trim to zero, for a robot that stands."""
+        self._slow_command, self._trim = ZERO, ZERO
+
+    def apply(self, command: Array, velocity: Array, yaw_rate: float) -> Array:
+        """Integrate the error of one tick.
+
+        Args:
+            command: vx, vy (m/s), wz (rad/s), stance (0 or 1), within limits, (4,).
+            velocity: Estimated velocity of the trunk, body frame, (3,), m/s.
+            yaw_rate: Measured turn rate, body frame, rad/s.
+
+        Returns:
+            The command for the policy, (4,).
+        """
+        if not self._bound:
+            return command
+        vx, vy, wz, stance = command.tolist()
+        wanted = vx, vy, wz
+        distance = self._follow(wanted)
+        if stance >= 0.5:
+            self._trim = ZERO
+            return command
+        if distance <= SETTLED:
+            errors = vx - float(velocity[0]), vy - float(velocity[1]), wz - yaw_rate
+            trim = (i + e * TICK_S / INTEGRATION_S for i, e in zip(self._trim, errors, strict=True))
+            ix, iy, iz = (min(max(i, -self._bound), self._bound) for i in trim)
+        else:
+            ix, iy, iz = (i * self._decay for i in self._trim)
+        self._trim = ix, iy, iz
+        return np.array([*self._limits.clamp((vx + ix, vy + iy, wz + iz)), stance])
+
+    def _follow(self, wanted: Axes) -> float:
+        """Update the low-pass of the command; return the command's largest distance from it, m/s or rad/s."""
+        sx, sy, sz = (
+            s + self._settling_share * (c - s) for c, s in zip(wanted, self._slow_command, strict=True)
+        )
+        self._slow_command = sx, sy, sz
+        return max(abs(c - s) for c, s in zip(wanted, self._slow_command, strict=True))
