@@ -67,6 +67,13 @@ def test_the_trim_fades_while_the_command_changes_and_ends_in_stance() -> None:
     np.testing.assert_array_equal(robot.got, (1.0, 0.0, 0.0, 0.0))
 
 
+def test_a_robot_that_brakes_to_a_stand_is_not_trimmed() -> None:
+    robot = SlowRobot((0.0, 0.0, 0.0))
+    robot.velocity = np.array([0.3, -0.3, 0.2])
+    robot.walk((0.0, 0.0, 0.0, 0.0), 0.5)
+    np.testing.assert_array_equal(robot.got, np.zeros(4))
+
+
 def test_a_noisy_command_counts_as_constant() -> None:
     robot, rng = SlowRobot((-0.06, 0.0, 0.0)), np.random.default_rng(0)
     for vx in rng.uniform(0.98, 1.02, 400):

@@ -36,7 +36,7 @@ class VelocityTrim:
 
         i' = (c - v) / INTEGRATION_S  where |c - s| <= SETTLED on all axes, |i| <= bound
         i' = -i / INTEGRATION_S       elsewhere: the command changes
-        i  = 0                        in stance
+        i  = 0                        in stance, or for a zero velocity: the robot brakes
 
     The policy gets c + i, within its limits.
     """
@@ -73,7 +73,7 @@ class VelocityTrim:
         vx, vy, wz, stance = command.tolist()
         wanted = vx, vy, wz
         distance = self._follow(wanted)
-        if stance >= 0.5:
+        if stance >= 0.5 or not any(wanted):
             self._trim = ZERO
             return command
         if distance <= SETTLED:
