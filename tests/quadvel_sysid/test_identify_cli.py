@@ -62,6 +62,19 @@ def test_a_log_that_is_fitted_is_not_held_out_as_well(
     assert "log.npz: named twice" in capsys.readouterr().err
 
 
+def test_a_robot_that_does_not_exist_is_refused_before_the_logs_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = str(tmp_path / "missing.npz")
+    monkeypatch.setattr(sys, "argv", ["identify", log, "--robot", "no_robot", "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 2
+    error = capsys.readouterr().err
+    assert "no_robot" in error
+    assert "missing.npz" not in error
+
+
 def test_recordings_are_read_where_no_middleware_is_installed(tmp_path: Path) -> None:
     recording = mcap(tmp_path / "walk.mcap", fields() | {"dq": -fields()["dq"]})
     program = (

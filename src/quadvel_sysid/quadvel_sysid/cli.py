@@ -22,6 +22,7 @@ from typing_extensions import override
 
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description.robot import is_robot, load_robot
+from quadvel_description.robot_name import shipped_robots
 from quadvel_recordings.output import output_folder
 
 from .logs.check_log import CheckedLog, check_logs
@@ -187,7 +188,7 @@ def identify(
             raise ValueError(f"{twice[0]}: named twice, expected each log once, for the fit or held out")
         return_freed_arrays_to_system()
         names = ColumnMap() if columns is None else ColumnMap.load(columns)
-        kind = robot if robot is not None and is_robot(robot) else None
+        kind = _robot_of_logs(robot)
         parameters = None
         if base is not None:
             parameters = ActuatorParameters.load(load_robot(kind) if kind else None, base, some_joints=True)
@@ -201,6 +202,24 @@ def identify(
             raise typer.Exit(WITHHELD_EXIT_CODE)
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
+
+
+def _robot_of_logs(robot: str | None) -> str | None:
+    """Check `--robot` before logs are read; return it if the logs may be of that robot, None for a mere body.
+
+    Raises:
+        FileNotFoundError: There is no such robot or file.
+        ValueError: The file of the robot is malformed.
+    """
+    if robot is None:
+        return None
+    if is_robot(robot):
+        load_robot(robot)
+        return robot
+    if not Path(robot).is_file():
+        expected = f"{', '.join(shipped_robots())}, the folder of a robot, an MJCF or a URDF file"
+        raise FileNotFoundError(f"--robot: found {robot!r}, expected {expected}")
+    return None
 
 
 def _identify(
