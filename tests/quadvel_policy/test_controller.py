@@ -413,6 +413,14 @@ def test_a_command_that_is_refused_is_named_once_the_last_fit_one_is_old(robot: 
     assert "command is refused: linear is [nan" in report.findings[0]
 
 
+def test_the_trim_of_a_slow_robot_is_reported(robot: Robot) -> None:
+    walk(robot)
+    for _ in range(8):
+        robot.order(0.5)
+        robot.step(50)
+    robot.graph.diagnosed("velocity_trim: 0.100, 0.000 m/s, 0.000 rad/s")
+
+
 def test_unfit_velocities_and_commands_are_refused_and_the_last_fit_ones_stay(robot: Robot) -> None:
     walk(robot)
     robot.velocity = np.nan

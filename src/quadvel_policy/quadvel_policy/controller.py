@@ -226,6 +226,7 @@ class Controller(Node):
             "robot": self._settings.robot,
             "policy": self._settings.policy or f"the shipped one ({SHIPPED_POLICY.name})",
             **{name: number_text(value, ".4g") for name, value in attrs.asdict(self._loop_summary).items()},
+            "velocity_trim": "{:.3f}, {:.3f} m/s, {:.3f} rad/s".format(*self._supervisor.trim),
             "pauses": self._loop.stall_detector.count,
             "stalled_s": f"{self._loop.stalled:.3f}",
             **{f"limit {name}": f"acted in {count} ticks" for name, count in self._supervisor.limits.items()},

@@ -298,6 +298,11 @@ class Walk:
         self.inference_seconds = float("nan")
         self.reset()
 
+    @property
+    def trim(self) -> tuple[float, float, float]:
+        """What is added to the commanded vx, vy (m/s) and wz (rad/s) now."""
+        return self._trim.trim
+
     def reset(self) -> None:
         """Reset the policy's recurrent state, past observations and previous action, and the trim."""
         self._policy.reset()

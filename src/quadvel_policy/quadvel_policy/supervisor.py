@@ -150,6 +150,11 @@ class Supervisor:
         return self._situation.reason
 
     @property
+    def trim(self) -> tuple[float, float, float]:
+        """What is added to the commanded vx, vy (m/s) and wz (rad/s) now; zero unless the robot walks."""
+        return self._walk.trim if self._walk and self.mode == "walk" else (0.0, 0.0, 0.0)
+
+    @property
     def walk_refusal(self) -> str:
         """Why the robot does not follow a velocity now, one sentence; "" if it does."""
         return walk_refusal(self._situation)

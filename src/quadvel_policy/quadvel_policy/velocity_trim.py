@@ -39,6 +39,9 @@ class VelocityTrim:
         i  = 0                        in stance, or for a zero velocity: the robot brakes
 
     The policy gets c + i, within its limits.
+
+    Attributes:
+        trim: The present trim i of vx, vy (m/s) and wz (rad/s).
     """
 
     def __init__(self, limits: VelocityCommandLimits, bound: float) -> None:
@@ -55,7 +58,7 @@ class VelocityTrim:
 
     def reset(self) -> None:
         """Set the trim to zero, for a robot that stands."""
-        self._slow_command, self._trim = ZERO, ZERO
+        self._slow_command, self.trim = ZERO, ZERO
 
     def apply(self, command: Array, velocity: Array, yaw_rate: float) -> Array:
         """Integrate the error of one tick.
@@ -74,15 +77,15 @@ class VelocityTrim:
         wanted = vx, vy, wz
         distance = self._follow(wanted)
         if stance >= 0.5 or not any(wanted):
-            self._trim = ZERO
+            self.trim = ZERO
             return command
         if distance <= SETTLED:
             errors = vx - float(velocity[0]), vy - float(velocity[1]), wz - yaw_rate
-            trim = (i + e * TICK_S / INTEGRATION_S for i, e in zip(self._trim, errors, strict=True))
+            trim = (i + e * TICK_S / INTEGRATION_S for i, e in zip(self.trim, errors, strict=True))
             ix, iy, iz = (min(max(i, -self._bound), self._bound) for i in trim)
         else:
-            ix, iy, iz = (i * self._decay for i in self._trim)
-        self._trim = ix, iy, iz
+            ix, iy, iz = (i * self._decay for i in self.trim)
+        self.trim = ix, iy, iz
         return np.array([*self._limits.clamp((vx + ix, vy + iy, wz + iz)), stance])
 
     def _follow(self, wanted: Axes) -> float:
