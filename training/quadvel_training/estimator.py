@@ -57,7 +57,7 @@ class VelocityNetwork(Recurrent):
         self.layout = layout
         with torch.no_grad():
             self.body[-1].bias[-1] = INITIAL_INERTIA_LOGIT
-        # Both are linear in the input, so one product computes them: their map has the image of each unit vector.
+        # Velocities and turn are linear in the input: the rows of their matrix are the images of the unit vectors.
         units = torch.eye(features.INPUT_SIZE)
         maps = torch.cat([self._velocities(units), self._turn(units)], dim=-1)
         self.register_buffer("maps", maps, persistent=False)
@@ -85,8 +85,8 @@ class VelocityNetwork(Recurrent):
         Returns:
             Velocity (m/s, body frame) and log variance (T, N, 6), and the new state.
         """
-        h, c = (part.split([MEMORY, 3], dim=-1) for part in state)
-        y, (hidden, memory) = self.lstm(x, (h[0].contiguous(), c[0].contiguous()))
+        (hidden, velocity), (cell, unused) = (part.split([MEMORY, 3], dim=-1) for part in state)
+        y, (hidden, cell) = self.lstm(x, (hidden.contiguous(), cell.contiguous()))
         correction, log_variance, logits = self.body(torch.nn.functional.silu(y)).split([3, 3, 5], dim=-1)
         share = logits.softmax(-1)
         # v[k] = sum_i s_i v_leg_i + s_4 (v[k-1] + dt (a + g - w x v[k-1])) + correction
@@ -96,12 +96,12 @@ class VelocityNetwork(Recurrent):
         velocities = known.reshape(*x.shape[:-1], 5, 3)
         added = share[..., None, :] @ velocities + correction[..., None, :]
         carried = share[..., 4:, None] * turn.reshape(*x.shape[:-1], 3, 3)
-        row, track = h[1].transpose(0, -2), []
+        row, track = velocity.transpose(0, -2), []  # row vectors: (N, 1, 3), or (1, 3) without N
         for k in range(x.shape[0]):
             row = row @ carried[k] + added[k]
             track.append(row)
         output = torch.cat([torch.stack(track).squeeze(-2), log_variance], dim=-1)
-        return output, (torch.cat([hidden, row.transpose(0, -2)], dim=-1), torch.cat([memory, c[1]], dim=-1))
+        return output, (torch.cat([hidden, row.transpose(0, -2)], dim=-1), torch.cat([cell, unused], dim=-1))
 
     def _velocities(self, x: torch.Tensor) -> torch.Tensor:
         """Return the velocity from each leg, and what inertia adds, dt (a + g); (..., 15), m/s."""
@@ -110,6 +110,7 @@ class VelocityNetwork(Recurrent):
 
     def _turn(self, x: torch.Tensor) -> torch.Tensor:
         """Return -dt [w]x, row by row, (..., 9): the matrix of v -> -dt w x v for row vectors."""
+        # spin[i, j] = e_i x e_j
         spin = torch.linalg.cross(*torch.broadcast_tensors(torch.eye(3)[:, None], torch.eye(3)))
         return -TICK_S * self._quantity(x, "angular_velocity") @ spin.reshape(3, 9)
 
@@ -150,7 +151,7 @@ class EstimatedWalks:
         self._estimate = np.zeros((n, 3))
 
     def sequence(self, length: int) -> Sequence:
-        """Collect a sequence.
+        """Collect a sequence; the memory of the network stays that of its start until `store_memory`.
 
         Args:
             length: number of ticks.
@@ -165,7 +166,7 @@ class EstimatedWalks:
                 sensed = walks.sense()
                 x = features.build(walks.env.robot, sensed, walks.previous_action, self.network.layout)
                 rows.append((x, walks.truth.copy(), ~walks.over))
-                # the controller has the estimate of the state before
+                # the controller has the estimate of the tick before
                 believed = np.where(self.on_estimate[:, None], self._estimate, walks.noisy_truth())
                 output, state = self.network(torch.from_numpy(x[None]), state)
                 self._estimate = output[0, :, :3].numpy()

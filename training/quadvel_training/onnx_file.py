@@ -79,9 +79,8 @@ def export(
     part = path.with_suffix(".part")
     path.parent.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", torch.jit.TracerWarning
-        )  # one step has one length, and constants are constants
+        # The tracer warns that a length and some tensors become constants: in a file of one step they are.
+        warnings.simplefilter("ignore", torch.jit.TracerWarning)
         torch.onnx.export(
             _Step(network, len(outputs)).eval(),
             (torch.zeros(1, size), *state),

@@ -59,6 +59,7 @@ def _on_loopback() -> dict[str, Parameters]:
 URGENT: Parameters = {"realtime_priority": 50}
 # Stand up and walk only on request of an operator; until then the policy is loaded but inactive.
 _BY_OPERATOR: Parameters = {"auto_stand": False, "require_operator": True}
+# robot_waits: simulated time stands still until a late answer comes.
 LOW_LEVELS = {
     "sim": LowLevel({"sim_node": {}}, {"auto_stand": True, "robot_waits": True}, simulation="sim_node"),
     "board": LowLevel(_on_loopback(), {"auto_stand": True}, simulation="board"),
@@ -129,7 +130,7 @@ class Stack:
         followers: dict[str, Parameters] = {
             "estimator": {**urgent, **robot, **_given(kind=self.estimator)},
             "controller": {**low_level.controller, **urgent, **robot, **_given(policy=policy)},
-            "command_mux": _given(),
+            "command_mux": {},
         }
         actuator = None if self.actuator is None else str(self.actuator.resolve())
         simulated = _given(terrain=self.terrain, world=absolute_file(self.world), actuator_file=actuator)
@@ -148,7 +149,7 @@ class Stack:
         """Return the arguments of ROS 2 of each node.
 
         Args:
-            view: Whether to add the node `view`, which keeps real time.
+            view: Whether to add the node `view`, which never uses simulated time.
 
         Returns:
             Arguments by name of the node.

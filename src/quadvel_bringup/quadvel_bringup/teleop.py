@@ -13,6 +13,7 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import ModuleType
 from typing import Any
 
 import attrs
@@ -86,7 +87,7 @@ class Teleop:
         self._publisher = session.node.create_publisher(Twist, "cmd_vel_teleop", 10)
         self._states = session.listen(ControllerState, "controller/state")
         self._set_mode = session.node.create_client(SetMode, "controller/set_mode")
-        self._asked = 0.0
+        self._asked_at = 0.0
 
     def wait_for_robot(self) -> None:
         """Wait for the controller.
@@ -127,7 +128,7 @@ class Teleop:
             self._operator.hold(HOLDER_ID, velocity, now)
         self._publish(self._operator.velocity(now))
         mode = self._states[-1].mode_name if self._states else ""
-        if self._operator.should_resend_stop(mode, now - self._asked):
+        if self._operator.should_resend_stop(mode, now - self._asked_at):
             self._ask("passive")
         self._session.spin(PUBLISH_PERIOD_S)
 
@@ -156,7 +157,7 @@ class Teleop:
 
     def _ask(self, mode: str) -> None:
         """Request a mode without waiting for the answer."""
-        self._asked = time.monotonic()
+        self._asked_at = time.monotonic()
         self._set_mode.call_async(SetMode.Request(mode=mode))
 
 
@@ -184,7 +185,7 @@ def drive_by_keyboard() -> int:
             keys.press(key, time.monotonic())
         return keys.velocity(time.monotonic())
 
-    print("".join(str(keyboard.__doc__).partition("\n\n")[1:]).strip("\n"))
+    print(_help_text(keyboard))
     with _cbreak_terminal():
         _drive(hear, lambda: keys.speed, KEYS)
     return 0
@@ -210,10 +211,15 @@ def drive_by_gamepad() -> int:
             raise ValueError(f"{device.name}: the gamepad was disconnected") from None
         return pad.velocity()
 
-    print("".join(str(gamepad.__doc__).partition("\n\n")[1:]).strip("\n"))
+    print(_help_text(gamepad))
     print(f"by {device.name}")
     _drive(hear, lambda: pad.speed, BUTTONS, lambda: SILENCE_NOTE if pad.timed_out else "")
     return 0
+
+
+def _help_text(module: ModuleType) -> str:
+    """Return the help for the operator: the docstring of a module without its first paragraph."""
+    return "".join(str(module.__doc__).partition("\n\n")[1:]).strip("\n")
 
 
 def restore_gamepad(pad: Gamepad, device: Any) -> str:
@@ -272,7 +278,7 @@ def _cbreak_terminal() -> Iterator[None]:
 
 
 def _find_gamepad() -> Any:
-    """Return the first device with a dead-man's button and sticks, or raise ValueError."""
+    """Return the first device with a dead-man's button, or raise ValueError."""
     import evdev
 
     for path in evdev.list_devices():

@@ -74,8 +74,8 @@ TensorShapeProto.Dimension: 1 dim_value int, 2 dim_param text, 3 denotation text
 """
 MESSAGES: dict[str, dict[int, Field]] = {
     kind: {
-        int(number): Field(name, field.rstrip("*"), field.endswith("*"))
-        for number, name, field in (one.split() for one in fields.split(","))
+        int(number): Field(name, starred.rstrip("*"), starred.endswith("*"))
+        for number, name, starred in (one.split() for one in fields.split(","))
     }
     for kind, fields in re.findall(r"^(\S+): (.*(?:\n    .*)*)", _FORMAT, re.MULTILINE)
 }
@@ -246,13 +246,20 @@ class _Reader:
             position = after
         return found
 
-    def _values(self, field: Field, wire_type: int, number: int, place: tuple[int, int, int]) -> list[Any]:
-        """Read the values of a field; place: start of its key, start and end of its value."""
+    def _values(self, field: Field, wire_type: int, varint: int, place: tuple[int, int, int]) -> list[Any]:
+        """Read the values of a field.
+
+        Args:
+            field: The field.
+            wire_type: Its encoding.
+            varint: Its number, if it is encoded as one.
+            place: Start of its key, start and end of its value.
+        """
         start, position, after = place
         if field.kind == OPAQUE:
             return [self._content[start:after]]
         if field.kind == INT and wire_type == 0:
-            return [_signed(number)]
+            return [_signed(varint)]
         if field.kind == INT and field.repeated and wire_type == 2:
             return self._numbers(position, after)
         if wire_type != WIRE_TYPES.get(field.kind, 2):

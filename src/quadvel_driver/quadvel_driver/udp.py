@@ -44,7 +44,7 @@ class UdpConfig(LinkConfig):
 
 
 class UdpTransport(Transport):
-    """Socket that is connected to one board: the kernel drops datagrams of others.
+    """Socket that is connected to one board: from then on the kernel drops datagrams of others.
 
     Attributes:
         local_port: Local UDP port.

@@ -70,7 +70,8 @@ _IMU = [
     *(("quaternion", "<f4", 4), ("angular_velocity", "<f4", 3), ("linear_acceleration", "<f4", 3)),
     *(("rpy", "<f4", 3), ("imu_temperature", "i1")),
 ]
-_IMU_OFFSET, _IMU_NUMBERS = 10, 10  # byte offset, and count of the IMU numbers before rpy
+_IMU_OFFSET = np.dtype(_HEADER).itemsize  # bytes
+_IMU_NUMBERS = 4 + 3 + 3  # quaternion, angular velocity, linear acceleration
 _COMMAND: Final = np.dtype([*_HEADER, ("motors", _MOTOR_COMMAND, SLOTS), ("led", "V12"), *_TAIL])
 _STATE: Final = np.dtype(
     [
@@ -121,7 +122,9 @@ def encode_command(command: JointCommand) -> bytes:
     """
     if command.mode not in (MODE_DAMPING, MODE_SERVO):
         raise WireError(f"command: mode is {command.mode}, expected {MODE_DAMPING} or {MODE_SERVO}")
-    numbers = command_numbers(command, _location)
+    numbers = command_numbers(
+        command, _location
+    )  # rows q, dq, tau, kp, kd; refuses numbers that are not finite
     numbers = np.minimum(np.maximum(numbers, _COMMAND_MIN), _COMMAND_MAX).astype(np.float32)
     packet = np.zeros(1, _COMMAND)
     packet["level_flag"] = LOW_LEVEL

@@ -53,7 +53,7 @@ def tracking_figure(recording: Recording, frames: Sequence[tuple[str, NDArray[np
 def _tracking_panels(panels: Any, recording: Recording) -> None:
     """Plot the three velocities, one panel per axis."""
     start, end = _walked_interval(recording)
-    planar = Series(recording.velocity.time, recording.velocity.value[:, [0, 1, 5]])
+    planar = Series(recording.velocity.time, recording.velocity.value[:, [0, 1, 5]])  # vx, vy, wz
     for axis, (panel, name) in enumerate(zip(panels, AXIS_LABELS, strict=True)):
         lines = [("commanded", recording.commanded, "black"), ("true", _moving_average(planar), "tab:blue")]
         if axis < 2:  # the yaw rate is measured, not estimated
@@ -69,8 +69,8 @@ def _tracking_panels(panels: Any, recording: Recording) -> None:
 
 def _walked_interval(recording: Recording) -> tuple[float, float]:
     """Start of the first and end of the last segment, s."""
-    stretches = constant_commands(recording.planned.time, recording.planned.value)
-    return stretches[0][0], stretches[-1][1]
+    segments = constant_commands(recording.planned.time, recording.planned.value)
+    return segments[0][0], segments[-1][1]
 
 
 def _moving_average(series: Series) -> Series:
@@ -90,10 +90,11 @@ def loop_figure(recording: Recording) -> Figure:
     Returns:
         The figure.
     """
-    sent = recording.answer_time.time + recording.answer_time.value[:, 0]
+    answer_time = recording.answer_time  # from each state to its command, s
+    sent = answer_time.time + answer_time.value[:, 0]
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    _distribution(left, 1e3 * recording.answer_time.value[:, 0], "from state to command, ms")
+    _distribution(left, 1e3 * answer_time.value[:, 0], "from state to command, ms")
     _distribution(right, 1e3 * np.diff(sent), "period of the commands, ms")
     return figure
 

@@ -77,7 +77,7 @@ class RecordedRun(ABC):
 
         Args:
             node: The recorder's node.
-            recorded: Number of recorded messages by topic so far; topics without one are not there.
+            recorded: Number of recorded messages by topic so far; a topic is absent until its first message.
         """
 
     @abstractmethod
@@ -88,7 +88,7 @@ class RecordedRun(ABC):
             ended: Exit codes of ended processes by name.
 
         Returns:
-            True if it did; `failure` says what makes it fail.
+            True if so; `failure` reports a run that can no longer complete.
         """
 
     def failure(self) -> str:
@@ -145,7 +145,9 @@ class RecordedRun(ABC):
 
     def _wait(self, group: ProcessGroup, signals: StopSignals, record: Callable[[], None]) -> str:
         """Record until the run is complete, or a node ended unexpectedly."""
-        watch, ended, failure = PageWatch(group, self._output), dict[str, int](), ""
+        watch = PageWatch(group, self._output)  # the operator page may end without ending the run
+        ended: Mapping[str, int] = {}
+        failure = ""
         while not (self.is_over(ended) or ended or failure or signals.received):
             record()
             ended, failure = watch.ended(), self.failure()

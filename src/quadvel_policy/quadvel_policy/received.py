@@ -40,7 +40,7 @@ class StampCheck:
         if now < self._now:
             self._stamp = -math.inf
         self._now = now
-        if not abs(now - stamp) <= self._limit:
+        if not abs(now - stamp) <= self._limit:  # also refuses NaN
             ago = f"{now - stamp:.3f} s old" if stamp < now else f"{stamp - now:.3f} s ahead of the clock"
             raise MessageError(f"stamp is {ago}, expected at most {self._limit:.3f} s")
         if stamp < self._stamp:

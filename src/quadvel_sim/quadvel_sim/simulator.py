@@ -40,9 +40,8 @@ _TICK_MODULUS = 2**32
 # Limit of a jammed joint: time constant of two steps (s), damping ratio; impedance that hardly yields.
 _JAM_SOLREF, _JAM_SOLIMP = (2.0 * DT, 1.0), (0.999, 0.9999, 1e-3, 0.5, 2.0)
 _PAYLOAD_RADIUS_M = 0.05  # the payload is a solid sphere: I = 2/5 m r^2
-_Array = Array
 # q, kp, kd, dq, tau: arguments of ActuatorModel.step
-_CommandArrays = tuple[_Array, _Array, _Array, _Array | float, _Array | float]
+_CommandArrays = tuple[Array, Array, Array, Array | float, Array | float]
 
 
 @attrs.define
@@ -62,18 +61,18 @@ class Truth:
 
     time: float
     tick: int
-    position: _Array
-    quaternion: _Array
-    linear_velocity: _Array
-    angular_velocity: _Array
+    position: Array
+    quaternion: Array
+    linear_velocity: Array
+    angular_velocity: Array
     contact: Bools
-    contact_force: _Array
+    contact_force: Array
 
 
 MAX_PUSH_WEIGHTS = 10.0
 """Largest force of all pushes together, in weights of the robot; some 50 make the physics diverge."""
 MAX_PUSH_ARM_M = 0.2
-"""Largest torque of all pushes together, in weights of the robot times 1 m; 0.5 m make it diverge."""
+"""Lever arm of the robot's weight, m, that gives the largest torque of all pushes; with 0.5 m it diverges."""
 MAX_START_DEPTH_M = 0.01
 """Depth to which the lying robot may start inside an obstacle, m; a touch is no mistake of a world."""
 
@@ -83,7 +82,7 @@ class _Push:
     """A push that is under way."""
 
     body: int
-    wrench: _Array  # (6,) force and torque, world
+    wrench: Array  # (6,) force and torque, world
     steps_left: int
 
 
@@ -128,9 +127,9 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
     for leg, friction in zip(LEGS, config.friction, strict=True):
         model.geom(f"{leg}_foot").friction[0] = friction
     config.physics.apply(model)
-    foot, own = model.geom(f"{LEGS[0]}_foot"), model.geom_priority == SURFACE_PRIORITY
-    # A surface differs from the feet in its friction only.
-    model.geom_solref[own], model.geom_condim[own] = foot.solref, foot.condim
+    # A surface has a friction of its own, and otherwise behaves like a foot.
+    foot, is_surface = model.geom(f"{LEGS[0]}_foot"), model.geom_priority == SURFACE_PRIORITY
+    model.geom_solref[is_surface], model.geom_condim[is_surface] = foot.solref, foot.condim
     disable = mujoco.mjtDisableBit
     model.opt.disableflags |= disable.mjDSBL_AUTORESET  # a diverged run is an error, not a restart
     model.opt.disableflags |= disable.mjDSBL_ISLAND  # one island always; the search costs 10 %
@@ -257,7 +256,7 @@ class Simulator:
         self._is_derived_current = False
 
     def _make_actuator(self, seed: int) -> ActuatorModel:
-        """Create the actuator model; a plant with other drives overrides this."""
+        """Create the actuator model; a subclass with other drives overrides this."""
         return ActuatorModel(self.config.actuator, dt=DT, seed=seed)
 
     @property
@@ -300,19 +299,20 @@ class Simulator:
             FloatingPointError: The physics diverged.
         """
         model, data, q, dq = self.model, self.data, self._q, self._dq
-        torque, answer, more = data.ctrl, self.actuator.step, self.config.physics.substeps - 1
+        torque, actuator_step = data.ctrl, self.actuator.step
+        further_substeps = self.config.physics.substeps - 1
         surroundings, failed = self._surroundings, self._failed_joints
         for _ in range(n):
-            torque[:] = answer(q, dq, *self._active_command)
+            torque[:] = actuator_step(q, dq, *self._active_command)
             if failed:
                 torque[failed] = 0.0
-            if self._is_derived_current:  # mj_step1 is done: only the second half of the step remains
+            if self._is_derived_current:  # mj_forward has done the first half, mj_step1
                 mujoco.mj_step2(model, data)
                 self._is_derived_current = False
             else:
                 mujoco.mj_step(model, data)
-            if more:
-                mujoco.mj_step(model, data, more)
+            if further_substeps:
+                mujoco.mj_step(model, data, further_substeps)
             self._watchdog_left -= 1
             if self._watchdog_left == 0:
                 self._active_command = self._brake_command
@@ -351,7 +351,7 @@ class Simulator:
         self._pushes.append(_Push(self.model.body(body).id, wrench, max(1, round(duration / DT))))
         self._apply_pushes()
 
-    def _check_size(self, wrench: _Array) -> None:
+    def _check_size(self, wrench: Array) -> None:
         """Refuse a push with which all present ones are so large that the physics could diverge."""
         wrenches = np.array([wrench, *(push.wrench for push in self._pushes)]).reshape(-1, 2, 3)
         force, torque = np.linalg.norm(wrenches, axis=2).sum(axis=0)
@@ -440,14 +440,15 @@ class Simulator:
             mujoco.mj_contactForce(self.model, self.data, i, wrench)
             contact[foot] = True
             force[foot] += sign * wrench[:3] @ self.data.contact.frame[i].reshape(3, 3)
+        # MuJoCo: linear velocities of a free joint are in the world frame, angular ones in the body frame.
         quaternion = self.data.qpos[3:7].copy()
         return Truth(
             time=self.time,
             tick=self.tick,
             position=self.data.qpos[:3].copy(),
             quaternion=quaternion,
-            linear_velocity=rotate_inverse(quaternion, self.data.qvel[:3]),  # a free joint's: world frame
-            angular_velocity=self.data.qvel[3:6].copy(),  # and body frame
+            linear_velocity=rotate_inverse(quaternion, self.data.qvel[:3]),
+            angular_velocity=self.data.qvel[3:6].copy(),
             contact=contact,
             contact_force=force,
         )
@@ -485,7 +486,7 @@ class Simulator:
         self._update_derived()
         return self._surroundings.scan(self.data)
 
-    def persons(self) -> _Array:
+    def persons(self) -> Array:
         """Return position and heading of the people in the world frame.
 
         Returns:
@@ -540,7 +541,7 @@ def _command_arrays(command: JointCommand) -> _CommandArrays:
     return q, kp, kd, dq if np.count_nonzero(dq) else 0.0, tau if np.count_nonzero(tau) else 0.0
 
 
-def _rotated(quaternion: _Array, rotation: _Array) -> _Array:
+def _rotated(quaternion: Array, rotation: Array) -> Array:
     """Rotate `quaternion` (w, x, y, z) by a small `rotation` vector (rad) about body axes."""
     w, x, y, z = quaternion.tolist()
     a, b, c = (0.5 * rotation).tolist()

@@ -72,7 +72,7 @@ class World:
             "points of bumps", sum(patch.point_count for patch in self.patches), MAX_HEIGHT_POINTS
         )
         led = [i for i, person in enumerate(self.persons) if person.led]
-        if len(led) > 1 or led[1:] or (led and led[0] != 0):
+        if led not in ([], [0]):
             raise ValueError(f"persons: found `led` at indices {led}, expected index 0 or none")
         if float(self.height(0.0, 0.0)) != 0.0:
             raise ValueError("hills: found one at the origin, expected level ground where the robot starts")
@@ -128,9 +128,8 @@ class World:
         if not self.hills:
             return np.zeros(place.shape[:-1])
         centre, turn, half, steepness, top = self._hill_arrays
-        away = ((place[..., None, :] - centre)[..., None, :] @ turn)[
-            ..., 0, :
-        ]  # (..., hills, 2), along and across each
+        # Along and across each hill, (..., hills, 2).
+        away = np.einsum("...hi,hij->...hj", place[..., None, :] - centre, turn)
         rise = ((half - np.abs(away)) * steepness).min(-1)
         return np.asarray(np.minimum(rise, top).max(-1).clip(0.0))
 

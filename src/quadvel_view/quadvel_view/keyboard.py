@@ -52,7 +52,7 @@ class Keyboard:
 
         Args:
             key: Character or escape sequence.
-            now: s.
+            now: Time of a monotonic clock, s.
         """
         key = ARROWS.get(key, key)
         if key in ("+", "=", "-"):
@@ -73,7 +73,7 @@ class Keyboard:
         """Return the commanded velocity.
 
         Args:
-            now: s.
+            now: Time of a monotonic clock, s.
 
         Returns:
             (3,) vx, vy (m/s), wz (rad/s) while a key is held, else None.

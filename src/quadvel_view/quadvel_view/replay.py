@@ -65,14 +65,16 @@ def replay(
         viewer.close()
 
 
-def execute(playback: Playback, word: PageMessage) -> None:
+def execute(playback: Playback, order: PageMessage) -> None:
     """Execute an order of the page on the playback; orders to a robot are ignored.
+
+    The page's buttons offer the paces; `Playback` limits them.
 
     Args:
         playback: The playback.
-        word: The order.
+        order: The order.
     """
-    match word:
+    match order:
         case Play():
             playback.toggle()
         case Seek(time=moment):

@@ -1,6 +1,6 @@
 """Commands that are lost: the drive continues with an earlier one.
 
-The identification infers the times of losses from a log; here they are given or drawn.
+Here the losses are drawn; the identification infers their times from a log.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ class CommandHold(MemoryEffect):
         fresh = (u[0] != before).any(axis=-1, keepdims=True)
         lost = self.rng.random((*u[0].shape[:-1], 1)) < p["share"]
         held = np.where(fresh & ~lost, u[0], held)
-        return (x[0] + held - u[0], x[1]), (held, u[0])
+        position_error, speed_error = x
+        return (position_error + held - u[0], speed_error), (held, u[0])
 
 
 EFFECTS = (CommandHold,)

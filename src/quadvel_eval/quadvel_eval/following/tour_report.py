@@ -32,16 +32,16 @@ def write_tour(folder: Path, world: World, outcome: Outcome, samples: Sequence[T
         samples: Its samples.
 
     Returns:
-        The figures.
+        The summary, as in tour.json.
     """
-    figures = summarise_tour(outcome, samples)
-    write_json(folder / "tour.json", figures)
+    summary = summarise_tour(outcome, samples)
+    write_json(folder / "tour.json", summary)
     write_figure(folder / "tour.png", tour_figure(world, outcome.distance, samples))
-    return figures
+    return summary
 
 
 def tour_figure(world: World, distance: float, samples: Sequence[TourSample]) -> Figure:
-    """Draw the robot's path on the map, and distance and speed over time distance_axis.
+    """Draw the robot's path on the map, and below it distance and speed over time.
 
     Args:
         world: World of the tour.
@@ -82,40 +82,40 @@ def tour_figure(world: World, distance: float, samples: Sequence[TourSample]) ->
     return figure
 
 
-def tour_table(figures: Mapping[str, Any]) -> Table:
-    """Create a table of the figures, next to those of the paper.
+def tour_table(summary: Mapping[str, Any]) -> Table:
+    """Create a table of a summary, next to the paper's numbers.
 
     Args:
-        figures: Result of `summarise_tour`.
+        summary: Result of `summarise_tour`.
 
     Returns:
         The table.
     """
-    table = Table("", "here", "paper", title=f"Following through {figures['world']}, seed {figures['seed']}")
-    touched = ", ".join(f"{name} {count}x" for name, count in figures["touched"].items()) or "nothing"
+    table = Table("", "here", "paper", title=f"Following through {summary['world']}, seed {summary['seed']}")
+    touched = ", ".join(f"{name} {count}x" for name, count in summary["touched"].items()) or "nothing"
     n = number_text
     rows = [
         (
             "path length",
-            f"{n(figures['walked'], '.0f')} m in {n(figures['minutes'], '.1f')} min",
+            f"{n(summary['walked'], '.0f')} m in {n(summary['minutes'], '.1f')} min",
             "3100 m in 37 min",
         ),
-        ("fell", "yes" if figures["fell"] else "no", "no"),
-        ("stuck", "yes: it no longer moved on, and the tour ended" if figures["stuck"] else "no", "no"),
+        ("fell", "yes" if summary["fell"] else "no", "no"),
+        ("stuck", "yes: it no longer moved on, and the tour ended" if summary["stuck"] else "no", "no"),
         ("touched", touched, ""),
-        ("error of the velocity, mean", f"{n(figures['error_xy'], '.3f')} m/s", f"{PAPER_XY} m/s"),
-        ("error of the yaw rate, mean", f"{n(figures['error_wz'], '.3f')} rad/s", f"{PAPER_WZ} rad/s"),
-        ("distance, mean", f"{n(figures['distance_mean'], '.2f')} m", ""),
+        ("error of the velocity, mean", f"{n(summary['error_xy'], '.3f')} m/s", f"{PAPER_XY} m/s"),
+        ("error of the yaw rate, mean", f"{n(summary['error_wz'], '.3f')} rad/s", f"{PAPER_WZ} rad/s"),
+        ("distance, mean", f"{n(summary['distance_mean'], '.2f')} m", ""),
         (
             f"within {DISTANCE_BAND_M} m of the set distance",
-            f"{n(figures['distance_kept'], '.0%')} of the time",
+            f"{n(summary['distance_kept'], '.0%')} of the time",
             "",
         ),
-        ("smallest clearance from obstacles", _metres(figures["least_clearance"]), ""),
-        ("smallest clearance from people", _metres(figures["least_gap"]), ""),
-        ("person lost", f"{figures['losses']} times, {n(figures['lost_seconds'], '.0f')} s together", ""),
+        ("smallest clearance from obstacles", _metres(summary["least_clearance"]), ""),
+        ("smallest clearance from people", _metres(summary["least_gap"]), ""),
+        ("person lost", f"{summary['losses']} times, {n(summary['lost_seconds'], '.0f')} s together", ""),
     ]
-    if planner := figures.get("planner_ms"):
+    if planner := summary.get("planner_ms"):
         rows.append(("planner, mean and p99", f"{planner['mean']:.1f}, {planner['p99']:.1f} ms", ""))
     for row in rows:
         table.add_row(*row)

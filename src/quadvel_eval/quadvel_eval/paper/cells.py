@@ -34,7 +34,8 @@ def cell_job(setup: Setup, command: Command, seed: int, **labels: Any) -> Job:
     Returns:
         The job.
     """
-    return Job(labels, (run_cell, setup, Cell(command, seed), ()))
+    without_shadow_estimators = ()
+    return Job(labels, (run_cell, setup, Cell(command, seed), without_shadow_estimators))
 
 
 def cell_record(labels: Record, result: CellResult) -> Record:
@@ -48,12 +49,12 @@ def cell_record(labels: Record, result: CellResult) -> Record:
         Command, seed, mean velocity and errors (m/s, rad/s), jitter (rad), cost of transport.
     """
     cell, segment = result.cell, result.segment
-    mean = [None] * 3 if segment is None else segment.mean.tolist()
+    mean_velocity = [None] * 3 if segment is None else segment.mean.tolist()
     return {
         **labels,
         **dict(zip(("vx", "vy", "wz"), (round(c, 6) for c in cell.command), strict=True)),
         "seed": cell.seed,
-        **dict(zip(("mean_vx", "mean_vy", "mean_wz"), mean, strict=True)),
+        **dict(zip(("mean_vx", "mean_vy", "mean_wz"), mean_velocity, strict=True)),
         "error_xy": None if segment is None else segment.error_xy,
         "error_wz": None if segment is None else segment.error_wz,
         "jitter": result.jitter,

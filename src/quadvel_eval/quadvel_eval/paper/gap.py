@@ -27,7 +27,7 @@ from .section import Job, JobResults, Record, Row, Section, Study, by_policy, di
 
 LAG_S = 0.005  # s
 TRAINED = "as in training"
-"""Level of the plant with the robot's own actuator model."""
+"""Name of the plant with the robot's own actuator model."""
 COMMANDS: tuple[Command, ...] = (
     (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 1.0),
     (0.0, 0.0, -1.0), (1.0, 0.4, 0.0), (1.0, -0.4, 0.0), (0.8, 0.0, 0.8), (0.8, 0.0, -0.8),
@@ -79,7 +79,7 @@ def write_walk_log(robot: Robot, policy: Path, plant: str, out: Path, seed: int 
     Args:
         robot: The robot, a shipped one.
         policy: ONNX file of the policy.
-        plant: Level of one of `drive_conditions`.
+        plant: Name of a plant of `drive_conditions`.
         out: NPZ file to write, rows at 1 kHz.
         seed: Seed of the run.
 
@@ -147,12 +147,12 @@ class Gap(Section):
     """
 
     name: ClassVar[str] = "gap"
-    title: ClassVar[str] = "The gap: drives that hold what the model lacks"
+    title: ClassVar[str] = "The gap: drives with effects that the model lacks"
     method: ClassVar[str] = (
         "Ten commands of 6 s on the plant of the actuator model and on five others. Four have, in addition, dry friction "
         "(1.2 N m, 1.8 at rest), a torque limit of 24 N m that falls to nothing at 12 rad/s in the direction of motion, a "
         "torque that lags (first order, 5 ms), and a backlash of ±15 mrad. The fifth has the drives of the other shipped "
-        "robot. The shipped policy's training knew none of them; its teacher's drew wider torque limits. Errors are those of "
+        "robot. The shipped policy was trained with none of them, its teacher with more varied torque limits. Errors are those of "
         "the robots that did not fall; the cut of the error is against the first policy, on the walks that neither fell on. "
         "The paper's own gap is that between simulation and robot: RL-PD fell 3 times there, the EAM policies never."
     )

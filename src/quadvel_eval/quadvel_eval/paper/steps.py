@@ -73,7 +73,9 @@ def walk_episode(setup: Setup, seed: int, seconds: float) -> float | None:
         Time of the fall, s; None if the robot stayed on its feet.
     """
     walk, stood = record_until_fall(make_loop(setup, seed, ()), draw_commands(seed, seconds))
-    return None if stood else (0.0 if walk is None else len(walk.position) * CONTROL_PERIOD_S)
+    if stood:
+        return None
+    return len(walk.position) * CONTROL_PERIOD_S if walk else 0.0  # no walk: it fell at the first tick
 
 
 @attrs.frozen
@@ -115,8 +117,8 @@ class Steps(Section):
             mine = select(records, policy=policy)
             ends = np.sort(column(select(mine, fell=1), "ended"))
             times = np.concatenate([[0.0], ends, [self.seconds]])
-            left = 100.0 * (1.0 - np.append(np.arange(len(ends) + 1), len(ends)) / len(mine))
-            panel.step(times, left, where="post", label=policy)
+            fallen = np.append(np.arange(len(ends) + 1), len(ends))  # none at first; the last count stays
+            panel.step(times, 100.0 * (1.0 - fallen / len(mine)), where="post", label=policy)
         panel.set_xlabel("time, s")
         panel.set_ylabel("on their feet, %")
         panel.set_ylim(0.0, 105.0)

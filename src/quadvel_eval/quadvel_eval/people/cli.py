@@ -23,7 +23,7 @@ HEADS = {
     "recall": "recall",
     "precision": "precision",
     "persons": "people",
-    "persons_per_minute": "a minute",
+    "persons_per_minute": "people a minute",
     "switches_per_minute": "switches a minute",
     "kept": "right person kept",
     "rms": "position, m RMS",
@@ -61,7 +61,7 @@ def people_command(
             draw_tracks(ScanRecording.load(path), detector, out / f"{path.stem}.png")
     if runs:
         found["scenes"] = measure_scenes(runs, detector)
-        console.print(_table(f"simulated, {runs} each", found["scenes"]))
+        console.print(_table(f"simulated, {runs} scenes of each kind", found["scenes"]))
     with atomic_write(out / "people.json") as draft:
         draft.write_text(json.dumps(found, indent=1))
     console.print(f"written: {out}/people.json{', pictures' if scans is not None else ''}")

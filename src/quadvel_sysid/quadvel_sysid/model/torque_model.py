@@ -38,8 +38,7 @@ class Model:
 
     Attributes:
         samples: Rows of all logs.
-        window: Step of a drive that averages commands over it, s; 0 for a drive without such a
-            step.
+        window: Time over which the drive averages commands, s; 0 for a drive that does not.
         gains: Ratios of real to commanded kp and kd, (2, J). Where no gain is commanded, the gains
             themselves in N m/rad and N m s/rad.
         gain_groups: Group numbers of the joints, (J,); joints with the same number share their
@@ -49,7 +48,7 @@ class Model:
         effects: Effects, in the order in which they were added.
         law_gains: Gains as they were before a learned term was added, (2, J); None without one. A
             learned term can take over a part of the PD law, such as the speed from earlier angles;
-            the encoder noise that a model is charged for must not fall with it.
+            the encoder noise that a model is charged for must not fall because of that.
     """
 
     samples: Samples
@@ -118,12 +117,12 @@ class Model:
         """Return the variance of encoder noise that interpolation between rows removes from the residual.
 
         Measured states hold noise that the drive did not act on. A delay halfway between two rows
-        averages it, and so has a smaller error than one on a row, without being better.
+        averages it, and so has a smaller error than a delay of whole rows, without being better.
 
         Returns:
             Variance that a fair comparison of delays adds to the squared residual, (N, J), N^2 m^2.
         """
-        # tau holds g_p kp e_q + g_d kd e_dq, with the noise e of q and dq at the instant u.
+        # tau holds g_p kp e_q + g_d kd e_dq, with the noise e of q and dq.
         s, (q_noise, dq_noise) = self.signals, self.samples.sources.interpolated_noise
         kp, kd = self._charged_gains
         noise: Array = (kp * s.kp) ** 2 * q_noise + (kd * s.kd) ** 2 * dq_noise
@@ -132,8 +131,8 @@ class Model:
     def noise_averaged_by_effects(self, rows: Bools) -> Array:
         """Return the variance of encoder noise that the effects remove from the prediction.
 
-        Effects of earlier speeds and of accelerations can combine to a filter of dq: late speeds plus
-        an inertia of kd times that time are a prediction of dq from its neighbours. It reduces the
+        Effects of earlier speeds and of accelerations can combine to a filter of dq: the speed a time h
+        earlier, together with an inertia of kd h, predicts dq from the rows around it. It reduces the
         error by noise that the drive did not act on, and describes no property of the drive.
 
         Args:
@@ -203,6 +202,7 @@ class Model:
             for effect, value in on_errors:
                 error = self._apply_to_errors(effect, error, s, value)
             stiffness_torque, damping_torque = s.kp * error[0], s.kd * error[1]
+        # Gains that are the same in all candidates are multiplied once.
         g = gains[:1] if len(gains) > 1 and (gains == gains[0]).all() else gains
         x: Array = (
             g[..., 0, :][..., None, :] * stiffness_torque
@@ -219,8 +219,10 @@ class Model:
     ) -> tuple[Array, Array]:
         """Apply an effect of the stage ERRORS to the errors of position and speed."""
         after = effect.candidate.evaluate(error, s, value)
-        new, speed = (_select_active(effect.active, new, old) for new, old in zip(after, error, strict=True))
-        return new, speed
+        position, speed = (
+            _select_active(effect.active, new, old) for new, old in zip(after, error, strict=True)
+        )
+        return position, speed
 
     def drive_torque(self) -> Array:
         """Predict the torque of the drive, without the added torques.

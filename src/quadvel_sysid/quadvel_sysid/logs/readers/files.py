@@ -55,11 +55,11 @@ def read_file(path: Path, choose: ColumnChooser) -> RawArrays:
     if path.is_dir():
         return lerobot.read_lerobot(path, choose)
     packed = path.suffix == ".gz"
-    suffix = (path.suffixes[-2:-1] or [""])[0] if packed else path.suffix
+    suffix = Path(path.stem).suffix if packed else path.suffix
     reader = READERS.get(suffix.lower())
     if reader is None or (packed and reader not in (csv_table.read, documents.read_json)):
         raise LogError(formats.unreadable_reason(path, READERS))
     try:
         return reader(path, choose)
     except (zlib.error, EOFError, gzip.BadGzipFile) as error:
-        raise LogError(f"{path}: no whole file: {error or 'it is cut off'}") from None
+        raise LogError(f"{path}: not a complete file: {error or 'it is cut off'}") from None

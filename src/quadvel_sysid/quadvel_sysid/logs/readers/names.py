@@ -21,7 +21,7 @@ JOINT_NAMES_FIELD = "joint_names"
 TIME_FIELDS = ("t", "t_cmd")
 """Fields that hold times."""
 ALL_JOINTS = ""
-"""Stands for a joint if the column holds all joints, or a quantity that belongs to no joint."""
+"""Key instead of the name of a joint, for a column of all joints or of a quantity without joints."""
 ALIASES = {
     "t": ("time", "timestamp"),
     "q": ("dof_pos", "position", "positions", "observation.state"),
@@ -83,7 +83,7 @@ def _spellings() -> Mapping[tuple[str, ...], str]:
     for bases, measured, commanded in (
         (_ANGLE, "q", "q_des"),
         (_SPEED, "dq", "dq_des"),
-        (_TORQUE, "tau", ""),
+        (_TORQUE, "tau", ""),  # a commanded torque is no field of a log
     ):
         words |= dict.fromkeys(bases, measured)
         words |= {
@@ -98,7 +98,11 @@ def _spellings() -> Mapping[tuple[str, ...], str]:
 
 
 def _match_words(name: str) -> tuple[str, str] | None:
-    """Field and joint of a name by its words, or None."""
+    """Field and joint of a name by its words, or None.
+
+    The longest spelling of a field at the start (without leading words such as "motor") or at the
+    end of the name counts; the rest is the joint.
+    """
     found = [] if ".." in name else list(_WORD.finditer(name))
     words = [word[0].lower() for word in found]
     first = next((k for k, word in enumerate(words) if word not in _LEADING), len(words))
@@ -169,6 +173,6 @@ def _only_all_joints(columns: Mapping[str, str]) -> dict[str, str]:
 
 
 def _joints(found: Mapping[str, Mapping[str, str]], worded: Mapping[str, Mapping[str, str]]) -> set[str]:
-    """Joints that words may match: those of the angles, restricted to those of the commands."""
+    """Joints that words may match: those with angles and commands, or all with angles if none has both."""
     angles, commands = (set(found[field] or worded.get(field, {})) for field in ("q", "q_des"))
     return (angles & commands or angles) - {ALL_JOINTS}
