@@ -212,14 +212,15 @@ class PolicyReplay:
     @cached_property
     def base(self) -> Replay:
         """The replay with the unchanged policy and observation."""
-        return self.run(Variant("as the file says"))
+        return self._trimmed_base[1]
 
     @cached_property
-    def _max_trim(self) -> float:
-        """Bound of the controller's trim, m/s and rad/s: 0 if the commands show that it had none."""
-        usual, whole = SupervisorConfig().max_velocity_trim, Variant("the whole walk")
-        trimmed, untrimmed = (self._replay(whole, None, most).error for most in (usual, 0.0))
-        return 0.0 if untrimmed < trimmed else usual
+    def _trimmed_base(self) -> tuple[float, Replay]:
+        """Bound of the controller's trim (0 if it had none) that reproduces the commands best, and the base with it."""
+        usual = SupervisorConfig().max_velocity_trim
+        bases = {most: self._replay(Variant("as the file says"), None, most) for most in (usual, 0.0)}
+        most = 0.0 if bases[0.0].error < bases[usual].error else usual
+        return most, bases[most]
 
     @cached_property
     def _fault_time(self) -> float:
@@ -282,7 +283,7 @@ class PolicyReplay:
         Returns:
             The replay.
         """
-        return self._replay(variant, most, self._max_trim)
+        return self._replay(variant, most, self._trimmed_base[0])
 
     def _replay(self, variant: Variant, most: int | None, max_trim: float) -> Replay:
         meta, ticks, prepared = self.policy.metadata, self.ticks[:most], (variant.late, max_trim)
