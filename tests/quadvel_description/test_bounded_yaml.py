@@ -29,6 +29,8 @@ HOSTILE = {
     "many digits": ("9" * 5_000, "digits"),
     "no date": ("2001-99-99", "(month|ros__parameters)"),
     "length": ("a: 1\n" * (MAX_CHARACTERS // 4), "characters"),
+    "a key twice": ("a: 1\nb: {c: 2, c: 3}", "'c' a second time.* in line 2, column 11"),
+    "a section twice": ("a: {ros__parameters: {b: 1}}\na: {ros__parameters: {c: 2}}", "'a' a second time"),
     "tag of Python": ("!!python/object/apply:os.system [x]", "tag"),
 }
 READERS: dict[str, Callable[[Path], object]] = {
@@ -58,3 +60,8 @@ def test_a_few_aliases_are_read() -> None:
 def test_usual_depth_is_read() -> None:
     depth = MAX_DEPTH - 1
     assert load_yaml("[" * depth + "1" + "]" * depth)
+
+
+def test_a_merge_key_is_no_repetition() -> None:
+    text = "a: &a {x: 1}\nb: &b {y: 2}\nc: {<<: *a, <<: *b, x: 3}"
+    assert load_yaml(text)["c"] == {"x": 3, "y": 2}

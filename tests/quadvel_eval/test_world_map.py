@@ -57,3 +57,16 @@ def test_the_map_of_a_straight_path_has_a_height(write, tmp_path: Path) -> None:
     picture = matplotlib.image.imread(tmp_path / "map.png")[..., :3]
     dark_rows = (picture.min(axis=2) < 0.2).any(axis=1)  # frame, labels
     assert dark_rows.sum() > 0.4 * len(dark_rows)
+
+
+def test_the_map_has_the_name_of_the_file_whatever_the_world_is_called(
+    write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = write('name: "../../evil"\n' + STRAIGHT)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    app = typer.Typer(pretty_exceptions_enable=False)
+    app.command()(world_command)
+    CliRunner().invoke(app, [str(file)], catch_exceptions=False)
+    assert [path.name for path in tmp_path.rglob("*.png")] == ["mine.png"]
+    assert (tmp_path / "here" / "out" / "mine.png").exists()

@@ -45,6 +45,12 @@ def test_places_of_a_csv_are_passed_in_turn(tmp_path: Path) -> None:
     assert way.seconds == pytest.approx(4.0 + np.pi / 2 + 2.0, abs=0.1)
 
 
+def test_a_csv_of_a_spreadsheet_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    (tmp_path / "way.csv").write_text("\ufeffseconds,vx,vy,wz\n2,0.5,0,0\n", encoding="utf-8")
+    trajectory = load_trajectory(tmp_path / "way.csv", 0.5)
+    assert trajectory.pose[-1, 0] == pytest.approx(1.0, abs=0.01)
+
+
 def test_points_of_a_gpx_are_metres_from_the_first(tmp_path: Path) -> None:
     file = tmp_path / "way.gpx"
     file.write_text(

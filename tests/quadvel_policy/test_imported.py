@@ -335,6 +335,7 @@ def changed(content: Any, place: str, value: object) -> Any:
     [
         ("step_dt", None, "step_dt: found nothing, expected a finite number"),
         ("step_dt", 0.017, "step_dt: found 0.017, expected a multiple of 0.005 s"),
+        ("step_dt", 20.0, "step_dt: found 20.0, expected a multiple of 0.005 s, at most 0.1 s"),
         ("joint_ids_map", [0] * 12, "joint_ids_map: found [0, 0, "),
         ("stiffness", [1.0, 2.0], "stiffness: found [1.0, 2.0], expected a finite number or 12 of them"),
         ("damping", "soft", "damping: found 'soft'"),

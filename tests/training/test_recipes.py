@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -13,7 +14,7 @@ pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel-
 
 from quadvel_actuator import ActuatorModel
 from quadvel_estimator.learned import LearnedEstimator
-from quadvel_policy.policy_file import PolicyFile
+from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 from quadvel_training import loop, recipe, stages
 from quadvel_training.__main__ import main
 from quadvel_training.constrained import ConstrainedConfig
@@ -161,3 +162,46 @@ def test_a_recipe_that_does_not_exist_is_named_in_one_sentence(
     said = capsys.readouterr().err
     assert str(recipe_file) in said
     assert "Errno" not in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["walks", "--teacher", "{policy}"], "no checkpoint"),
+        (["limit", "{policy}", "--forward", "99"], "command_limits"),
+        (["limit", "{text}", "--forward", "1"], "text.onnx"),
+        (["privileged", "--recipe", "{recipe}"], "n: found 0"),
+        (["privileged", "--recipe", "{budget}"], "minutes: found -1"),
+        (["record", "--plant", "friction", "--out", "{log}"], "expected .npz"),
+    ],
+)
+def test_a_wrong_argument_or_file_is_named_in_one_sentence(
+    arguments: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    shutil.copy(SHIPPED_POLICY, tmp_path / "policy.onnx")
+    (tmp_path / "text.onnx").write_text("no network")
+    (tmp_path / "recipe.yaml").write_text("n: 0\n")
+    (tmp_path / "budget.yaml").write_text("budget: {minutes: -1}\n")
+    files = {
+        "policy": "policy.onnx",
+        "text": "text.onnx",
+        "recipe": "recipe.yaml",
+        "budget": "budget.yaml",
+        "log": "log.csv",
+    }
+    words = [word.format(**{name: tmp_path / file for name, file in files.items()}) for word in arguments]
+    before = sorted(path.name for path in tmp_path.iterdir())
+    monkeypatch.setattr(sys, "argv", ["quadvel_training", *words])
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("torch.set_num_threads", lambda count: None)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    error = capsys.readouterr().err.strip()
+    assert said in error
+    assert "\n" not in error
+    assert sorted(path.name for path in tmp_path.iterdir()) == before

@@ -15,6 +15,7 @@ import typer
 from rich.progress import Progress, TextColumn
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
+from quadvel_bringup.error_sentence import exit_with_sentence
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_estimator.kalman import KalmanConfig
@@ -41,7 +42,6 @@ from . import (
     kalman_tuning,
     leg_classifier,
     limiting,
-    loop,
     privileged,
     process_group,
     random_walks,
@@ -262,10 +262,7 @@ def record_log(
     policy: WalkingPolicy = SHIPPED_POLICY,
 ) -> None:
     """Record a walk on a plant whose drives have an effect that training never saw, as a log for `quadvel identify`."""
-    try:
-        gap.write_walk_log(load_robot(DEFAULT_ROBOT), policy, plant, out)
-    except ValueError as error:
-        raise typer.BadParameter(str(error)) from None
+    gap.write_walk_log(load_robot(DEFAULT_ROBOT), policy, plant, out)
     _written(out)
 
 
@@ -404,17 +401,11 @@ def main() -> None:
     """Run the program; errors in files are printed in one sentence.
 
     Raises:
-        SystemExit: a recipe, checkpoint or other file is wrong or missing; exit code 2.
+        SystemExit: an argument, a recipe, a checkpoint or another file is wrong or missing; exit code 2.
     """
     torch.set_num_threads(env.available_cores())
-    try:
+    with exit_with_sentence("quadvel_training"):
         app()
-    except (recipe.RecipeError, loop.CheckpointError, FileNotFoundError) as error:
-        missing = isinstance(error, FileNotFoundError) and error.filename
-        print(
-            f"quadvel_training: {f'{missing}: there is no such file' if missing else error}", file=sys.stderr
-        )
-        raise SystemExit(2) from None
 
 
 if __name__ == "__main__":

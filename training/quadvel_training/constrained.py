@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from quadvel_description import symmetry
+from quadvel_description.fields import field
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_policy.observation import OBSERVATION_SIZE
@@ -82,7 +83,7 @@ class ConstrainedConfig:
 
     robot: str = DEFAULT_ROBOT
     budget: Budget = Budget(samples=1e8, minutes=6e3)
-    n: int = 512
+    n: int = field(512, at_least=1, whole=True)
     threads: int = attrs.field(factory=available_cores)
     length: int = 64
     std: float = 0.045

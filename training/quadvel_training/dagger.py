@@ -31,6 +31,7 @@ import torch
 from torch import Tensor
 
 from quadvel_description import symmetry
+from quadvel_description.fields import field
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_policy.observation import (
@@ -96,7 +97,7 @@ class DaggerConfig:
 
     robot: str = DEFAULT_ROBOT
     budget: Budget = Budget(samples=2e7, minutes=60.0)
-    n: int = 512
+    n: int = field(512, at_least=1, whole=True)
     threads: int = attrs.field(factory=available_cores)
     length: int = 256
     epochs: int = 2

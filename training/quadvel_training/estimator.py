@@ -17,6 +17,7 @@ import attrs
 import numpy as np
 import torch
 
+from quadvel_description.fields import field
 from quadvel_description.network_input import InputLayout
 from quadvel_description.quadruped import GRAVITY
 from quadvel_description.robot import load_robot
@@ -223,7 +224,7 @@ class EstimatorConfig:
 
     robot: str = DEFAULT_ROBOT
     budget: Budget = Budget(samples=8e6, minutes=15.0)
-    n: int = 512
+    n: int = field(512, at_least=1, whole=True)
     length: int = 48
     epochs: int = 2
     learning_rate: float = 2e-3

@@ -6,6 +6,7 @@ The stages (`privileged`, `constrained`, `dagger`, `estimator`) supply what is l
 from __future__ import annotations
 
 import math
+import pickle
 import signal
 import time
 from collections import defaultdict
@@ -19,6 +20,8 @@ import attrs
 import torch
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from torch.utils.tensorboard import SummaryWriter
+
+from quadvel_description.fields import positive
 
 from . import process_group
 
@@ -43,8 +46,8 @@ class Budget:
         minutes: duration from the start or the latest resumption, minutes.
     """
 
-    samples: float
-    minutes: float
+    samples: float = positive()
+    minutes: float = positive()
 
 
 class Run(Protocol):
@@ -207,10 +210,14 @@ def load(path: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: there is no such file.
+        CheckpointError: the file is no checkpoint.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such checkpoint")
-    content: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
+    try:
+        content: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
+    except (pickle.UnpicklingError, RuntimeError, EOFError):
+        raise CheckpointError(f"{path}: no checkpoint, expected one of quadvel_training (.pt)") from None
     return content
 
 

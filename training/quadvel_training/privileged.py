@@ -18,6 +18,7 @@ import torch
 from typing_extensions import override
 
 from quadvel_description import symmetry
+from quadvel_description.fields import field
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_description.symmetry import sign_mirror
@@ -195,7 +196,7 @@ class PrivilegedConfig:
 
     robot: str = DEFAULT_ROBOT
     budget: Budget = Budget(samples=2e8, minutes=6e3)
-    n: int = 512
+    n: int = field(512, at_least=1, whole=True)
     threads: int = attrs.field(factory=available_cores)
     length: int = 24
     timestep: float = 0.004

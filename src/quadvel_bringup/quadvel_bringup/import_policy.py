@@ -54,6 +54,9 @@ def import_command(
       quadvel eval --grid quick --robot go2 --policy go2.onnx --estimator kalman
     """
     output_file(out)
+    for given in (weights, *([config] if config else [])):
+        if out.resolve() == given.resolve():
+            raise ValueError(f"--out: found {out}, a file that is read, expected another one")
     supplement = Supplement(limits=limits, rate_hz=rate)
     metadata, content = import_policy(load_robot(robot), weights, config, supplement)
     with atomic_write(out) as draft:

@@ -15,6 +15,8 @@ MAX_NODES = 100_000
 """Largest number of values, lists and mappings; those under an alias count each time."""
 MAX_DEPTH = 20
 """Largest number of nested lists and mappings."""
+MERGE_TAG = "tag:yaml.org,2002:merge"
+"""Tag of the key `<<`, which takes over the values of other mappings."""
 
 
 class BoundedLoader(yaml.SafeLoader):
@@ -67,10 +69,31 @@ class BoundedLoader(yaml.SafeLoader):
             self._sizes[event.anchor] = self._count - before
         return node
 
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Construct a mapping that has each key once; YAML loaders drop all but the last.
+
+        Args:
+            node: The mapping.
+            deep: Whether to construct what it contains at once.
+
+        Returns:
+            The mapping.
+
+        Raises:
+            yaml.YAMLError: A key is repeated.
+        """
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != MERGE_TAG:
+                if key.value in seen:
+                    self._raise_yaml_error(f"the key {key.value!r} a second time, expected it once", key)
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
     @staticmethod
-    def _raise_yaml_error(found: str, event: Any) -> NoReturn:
-        """Raise a YAMLError with line and column of the event."""
-        mark = event.start_mark
+    def _raise_yaml_error(found: str, place: Any) -> NoReturn:
+        """Raise a YAMLError with line and column of an event or a node."""
+        mark = place.start_mark
         raise yaml.YAMLError(f"found {found}, in line {mark.line + 1}, column {mark.column + 1}")
 
 

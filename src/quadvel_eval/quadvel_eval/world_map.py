@@ -51,7 +51,7 @@ def world_command(
     Simulator(
         SimulatorConfig(robot=load_robot(DEFAULT_ROBOT), world=loaded)
     )  # refuses an obstacle at the start
-    path = output_file(Path(f"out/{loaded.name}.png") if out is None else out)
+    path = output_file(Path(f"out/{Path(world).stem}.png") if out is None else out)
     if path.suffix not in FORMATS:
         raise ValueError(f"{path}: found the suffix {path.suffix!r}, expected {', '.join(FORMATS)}")
     write_figure(path, draw_world(loaded))

@@ -215,7 +215,7 @@ def read_table(path: Path) -> tuple[list[str], Array]:
     Raises:
         ValueError: The file is malformed.
     """
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8-sig") as file:
         rows = list(csv.reader(file))
     head = [name.strip() for name in rows[0]] if rows else []
     if head not in (["seconds", "vx", "vy", "wz"], ["x", "y"]):
@@ -265,7 +265,7 @@ def _parse_angles(point: ElementTree.Element, number: int) -> tuple[float, float
 
 def _load_gpx(path: Path, speed: float) -> Trajectory:
     """Return the trajectory of a GPX file."""
-    text = path.read_text()
+    text = path.read_text(encoding="utf-8-sig")
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("has a document type or entities, which no track needs")
     points = [

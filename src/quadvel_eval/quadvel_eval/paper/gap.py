@@ -18,7 +18,7 @@ from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_description.arrays import Array
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot, load_robot
-from quadvel_recordings.output import atomic_write
+from quadvel_recordings.output import atomic_write, output_file
 
 from .cells import Command, cell_record, command_limits, count_falls, largest_error, mean_error
 from .conditions import Condition, condition_job, draw_error_and_survival
@@ -84,8 +84,11 @@ def write_walk_log(robot: Robot, policy: Path, plant: str, out: Path, seed: int 
         seed: Seed of the run.
 
     Raises:
-        ValueError: The plant is unknown.
+        ValueError: The plant is unknown, or `out` is no NPZ file.
     """
+    if out.suffix != ".npz":
+        raise ValueError(f"{out}: found the suffix {out.suffix!r}, expected .npz")
+    output_file(out)
     known = {one.level: one for one in drive_conditions(robot)}
     if plant not in known:
         raise ValueError(f"plant: found {plant!r}, expected one of {', '.join(known)}")

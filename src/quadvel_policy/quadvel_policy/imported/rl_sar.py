@@ -11,7 +11,7 @@ import numpy as np
 from quadvel_description.bounded_yaml import read_yaml
 from quadvel_description.quadruped import JOINT_NAMES
 
-from ..observation import JOINTS, RATE_HZ, Bounds
+from ..observation import JOINTS, Bounds
 from .metadata import ImportedMetadata
 from .observation import TERM_SIZES, ImportedTerm
 from .section import FormatError, Section, to_our_order
@@ -76,8 +76,7 @@ def read(path: Path, fields: Any, robot: str, output: str, limits: dict[str, Bou
         file.refuse("joint_names", ", ".join(JOINT_NAMES))
     joint_map = file.joint_map("joint_mapping")
     period = file.number("dt") * file.number("decimation")
-    if period <= 0.0 or not np.isclose(period * RATE_HZ, max(round(period * RATE_HZ), 1)):
-        file.refuse("decimation", f"dt * decimation to be a multiple of {1.0 / RATE_HZ:g} s")
+    file.check_period("decimation", period, "dt * decimation to be ")
     lower, upper = (file.numbers(f"clip_actions_{end}", JOINTS) for end in ("lower", "upper"))
     nominal, scale = file.numbers(POSTURE_FIELD, JOINTS), file.numbers("action_scale", JOINTS)
     targets = np.sort(np.array(nominal) + np.array([lower, upper]) * scale, axis=0)

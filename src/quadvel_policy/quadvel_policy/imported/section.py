@@ -12,7 +12,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from ..observation import JOINTS, MAX_GAINS, Vector
+from ..observation import JOINTS, MAX_GAINS, RATE_HZ, Vector
+
+MAX_PERIOD_S = 0.1
+"""Longest period of a policy, s: a slower one does not balance a robot; a number of 20 is in ms."""
 
 
 class FormatError(ValueError):
@@ -65,6 +68,21 @@ class Section:
         found = found if len(found) <= 120 else f"{found[:117]}..."
         path = self._files.get(name, self._path)
         raise FormatError(f"{path}: {self._name(name)}: found {found}, expected {expected}")
+
+    def check_period(self, name: str, period: float, quantity: str = "") -> None:
+        """Refuse a period that the control loop cannot keep.
+
+        Args:
+            name: The field that it comes from.
+            period: Period of the policy, s.
+            quantity: What must be such a period, if not the field alone, with "to be ".
+
+        Raises:
+            FormatError: It is no multiple of the control period, or longer than MAX_PERIOD_S.
+        """
+        ticks = max(round(period * RATE_HZ), 1)
+        if not 0.0 < period <= MAX_PERIOD_S or not np.isclose(period * RATE_HZ, ticks):
+            self.refuse(name, f"{quantity}a multiple of {1.0 / RATE_HZ:g} s, at most {MAX_PERIOD_S:g} s")
 
     def section(self, name: str) -> Section:
         """Open a mapping in this one.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..observation import JOINTS, RATE_HZ, Bounds
+from ..observation import JOINTS, Bounds
 from .metadata import UNBOUNDED, ImportedMetadata
 from .observation import TERM_SIZES, ImportedTerm
 from .section import Section, to_our_order
@@ -69,8 +69,7 @@ def read(path: Path, fields: Any, robot: str, output: str) -> ImportedMetadata:
     )  # fmt: skip
     joint_map = file.joint_map("joint_ids_map")
     period = file.number("step_dt")
-    if period <= 0.0 or not np.isclose(period * RATE_HZ, max(round(period * RATE_HZ), 1)):
-        file.refuse("step_dt", f"a multiple of {1.0 / RATE_HZ:g} s")
+    file.check_period("step_dt", period)
     nominal = file.numbers(POSTURE_FIELD, JOINTS)
     actions = file.section("actions")
     actions.allow_only(["JointPositionAction"])
