@@ -184,6 +184,10 @@ def test_degrees_become_radians_and_a_map_overrides_them(tmp_path: Path) -> None
         (PLAIN.replace("dq/knee", "q/knee"), "q/knee: the column stands there twice"),
         ("# only\n# comments\n", "expected"),
         ("t,q/knee,q_des/knee\n" + "1,nan,2\n" * 20, "q: no row holds a number"),
+        (
+            "t,q/hip,q/knee,q_des/hip,q_des/knee\n" + "1,1,nan,2,2\n" * 20,
+            "q/knee: no number, leave out this joint",
+        ),
     ],
 )  # fmt: skip
 def test_a_table_that_is_none_is_refused_by_line_and_column(tmp_path: Path, text: str, sentence: str) -> None:
