@@ -93,6 +93,8 @@ def test_tables_cannot_be_changed_by_accident():
         {"velocity_limit": 0.0},
         {"armature": [0.0, 0.0, -0.01]},
         {"lie_q": [0.0, 9.0, -1.0]},
+        {"foot_radius": 25.0},
+        {"name": "fourth"},
     ],
 )
 def test_a_wrong_number_of_a_robot_is_refused_by_its_name(tmp_path, change):

@@ -25,7 +25,7 @@ from .fields import field, positive, refusal, to_array
 from .inertia import Inertial, combine_inertials
 from .quadruped import JOINT_NAMES, LEGS
 from .records import read_document, structure_record
-from .robot_name import ROBOTS, UNNAMED_ROBOT, shipped_robots
+from .robot_name import ROBOTS, UNNAMED_ROBOT, described_robot, shipped_robots
 from .symmetry import mirror_joints
 from .urdf import read_links
 
@@ -64,8 +64,16 @@ def load_robot(robot: str) -> Robot:
     fields = read_document(file, "a YAML file of a robot", SCHEMA)
     if undecided := [name for name, value in fields.items() if value == UNDECIDED]:
         raise ValueError(f"{file}: {', '.join(undecided)}: found {UNDECIDED!r}, expected your numbers")
-    links = read_links(file.parent / "robot.urdf")
-    return structure_record(Robot, {**fields, "links": links, "folder": str(file.parent)}, file)
+    urdf = file.parent / "robot.urdf"
+    links = read_links(urdf)
+    found = structure_record(Robot, {**fields, "links": links, "folder": str(file.parent)}, file)
+    described = described_robot(urdf.read_text(encoding="utf-8"))
+    if described not in (None, found.name):
+        raise ValueError(
+            f"{file}: name: found {found.name!r}, expected {described!r} as in robot.urdf; for a new name write "
+            f"robot.urdf again: python -m quadvel_description.urdf_generator {file.parent}"
+        )
+    return found
 
 
 def is_robot(chosen: str) -> bool:
@@ -252,7 +260,7 @@ class Robot:
     armature: Array = _joints("kg m^2", at_least=0.0)
     joint_friction: Array = _joints("N m", at_least=0.0)
     joint_damping: Array = _joints("N m s/rad", at_least=0.0)
-    foot_radius: float = positive()
+    foot_radius: float = positive(at_most=0.1)
     drive: Drive = Drive()
     links: tuple[Link, ...]
     joint_links: tuple[Link, ...] = attrs.field(init=False)
