@@ -311,9 +311,9 @@ def _stack_columns(
     if scale is not None:
         values = values * np.asarray(scale)
     if values.ndim and len(values) and not count_whole_rows(values):
-        empty = np.flatnonzero(np.isnan(values).all(axis=0)) if values.ndim == 2 else ()
+        empty = np.flatnonzero(np.isnan(values).all(axis=0)).tolist() if values.ndim == 2 else []
         which = format_names([columns[k] if len(columns) > 1 else f"column {k}" for k in empty])
-        lost = f"; {which}: no number, leave out this joint in all fields" if len(empty) else ""
+        lost = f"; {which}: no number, leave out this joint in all fields" if empty else ""
         raise LogError(
             f"{path}: {field}: no row holds a number for each joint, {len(values)} rows are not finite{lost}"
         )
