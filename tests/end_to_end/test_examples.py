@@ -195,7 +195,7 @@ LEFT_OUT_KINDS = {
     r"mkdir -p out/checkpoints .*": "takes a checkpoint out of the history",
     r"(mkdir -p|cp training/checkpoints).* out/go2/.*": "takes checkpoints to the folders of the runs that follow",
     r"(board|driver|controller|command_mux|ros__parameters):": "a part of a parameter file; test_yaml_examples.py loads it",
-    r"(stick_velocity|max_tilt|max_velocity|stamped|imu_mounting): .*": "the same",
+    r"(stick_velocity|max_tilt|max_velocity|max_velocity_trim|stamped|imu_mounting): .*": "the same",
     r"\[project\.entry-points\..*|magnetic_drag = .*": "a part of another package's pyproject.toml; tests/quadvel_sysid has one",
     r"(t|q|dq|tau|kp|q_des|t_cmd|q_des_cmd|joint_names): .*": "a part of a map file for --columns",
 }

@@ -11,6 +11,8 @@ def write_third_robot(folder: Path) -> Path:
     """Write a robot like the Go2 by another name, for which no network is shipped; return its folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for file in GO2.folder.iterdir():
-        text = file.read_text().replace("name: go2", "name: third").replace("robot: go2", "robot: third")
+        text = file.read_text()
+        for before in ("name: go2", "robot: go2", 'robot name="go2"'):
+            text = text.replace(before, before.replace("go2", "third"))
         (folder / file.name).write_text(text)
     return folder
