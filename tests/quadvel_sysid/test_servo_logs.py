@@ -263,6 +263,7 @@ def test_a_table_may_hold_lists_in_its_cells_and_its_commands_in_another_file(tm
         ({"angle": "q"}, "angle: unknown, expected one of t, q, dq"),
         ({"q": {"column": "pos"}}, "q/column: unknown, expected one of from, scale"),
         ({"q": {"from": "pos", "scale": "deg"}}, "q/scale: found 'deg', expected a number"),
+        ({"q": {"from": "pos", "scale": 0}}, "q/scale: found 0, expected a number other than 0"),
         ({"q": 3}, r"q/from: found 3, expected a name"),
         ({"joint_names": "hip"}, "joint_names: found 'hip', expected a list"),
         (["q"], "expected a line for each field"),

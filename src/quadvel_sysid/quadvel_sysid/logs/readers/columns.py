@@ -103,7 +103,11 @@ class Source:
         file = entry.get("file")
         for field, good, expected in (
             ("from", all(isinstance(name, str) for name in names), "a name or a list of names"),
-            ("scale", scale is None or _is_numeric(scale), "a number, or one for each joint"),
+            (
+                "scale",
+                scale is None or (_is_numeric(scale) and np.all(np.asarray(scale, dtype=float))),
+                "a number other than 0, or one for each joint",
+            ),
             ("value", value is None or _is_numeric(value), "a number, or one for each joint"),
             (
                 "file",
