@@ -122,9 +122,8 @@ def encode_command(command: JointCommand) -> bytes:
     """
     if command.mode not in (MODE_DAMPING, MODE_SERVO):
         raise WireError(f"command: mode is {command.mode}, expected {MODE_DAMPING} or {MODE_SERVO}")
-    numbers = command_numbers(
-        command, _location
-    )  # rows q, dq, tau, kp, kd; refuses numbers that are not finite
+    # Rows q, dq, tau, kp, kd; numbers that are not finite are refused.
+    numbers = command_numbers(command, _location)
     numbers = np.minimum(np.maximum(numbers, _COMMAND_MIN), _COMMAND_MAX).astype(np.float32)
     packet = np.zeros(1, _COMMAND)
     packet["level_flag"] = LOW_LEVEL

@@ -31,7 +31,7 @@ ZERO: Axes = (0.0, 0.0, 0.0)
 class VelocityTrim:
     """Adds a bounded integral of the velocity error to the command of a policy.
 
-    With the command c and its low-pass s (SETTLING_S), the measured velocity v and the trim i, all of
+    With the command c and its low-pass s (SETTLING_S), the estimated velocity v and the trim i, all of
     (vx, vy, wz):
 
         i' = (c - v) / INTEGRATION_S  where |c - s| <= SETTLED on all axes, |i| <= bound
