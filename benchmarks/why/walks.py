@@ -312,6 +312,7 @@ class RecordedWalk:
             walk_refusal="",
             command=_twist(vx, vy, 0.0, wz),
             stance=bool(stance),
+            trim=_twist(*supervisor.trim[:2], 0.0, supervisor.trim[2]),
             overruns=0,
             refused=0,
             **dict.fromkeys(numbers, 0.0),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_eval.paper.gap import drive_conditions
 from quadvel_eval.robot_loop import CONTROL_PERIOD_S, RobotLoop, make_estimator
 from quadvel_policy.config import SupervisorConfig
@@ -21,7 +22,7 @@ def mean_velocity(max_trim: float) -> np.ndarray:
     simulator = Simulator(SimulatorConfig(robot=ALIENGO, seed=0, **plant))
     simulator.reset("stand")
     config = SupervisorConfig(max_velocity_trim=max_trim)
-    supervisor = Supervisor(ALIENGO, PolicyFile(ALIENGO), config)
+    supervisor = Supervisor(ALIENGO, PolicyFile(ALIENGO), config, KalmanEstimator(ALIENGO))
     loop = RobotLoop(simulator, supervisor, make_estimator("learned", simulator, None))
     loop.start_walking()
     truths = [loop.tick(AHEAD).truth for _ in range(round(WALK_S / CONTROL_PERIOD_S))]

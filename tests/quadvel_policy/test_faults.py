@@ -361,6 +361,16 @@ def test_a_walking_robot_follows_the_kalman_filter_where_the_estimate_is_missing
     np.testing.assert_allclose(rig.policy.seen[-1][30:33], rig.backup.velocity, atol=1e-6)
 
 
+def test_the_command_is_trimmed_by_the_kalman_filter_and_without_it_by_the_estimate(policy: Any) -> None:
+    rig = walking(policy)
+    rig.velocity, rig.backup.velocity = np.array([0.55, 0.0, 0.0]), np.array([0.45, 0.0, 0.0])
+    rig.run(4.0, FORWARD)
+    assert rig.supervisor.trim[0] > 0.05
+    rig.backup.velocity = np.full(3, np.nan)
+    rig.run(6.0, FORWARD)
+    assert rig.supervisor.trim[0] < -0.05
+
+
 def test_a_robot_that_knows_no_velocity_brakes_on_what_is_left_of_the_last_one(policy: Any) -> None:
     rig = walking(policy)
     rig.velocity = rig.backup.velocity = np.array([1.0, 0.0, 0.0])

@@ -53,6 +53,9 @@ def test_a_trimmed_command_stays_within_the_limits_of_the_policy() -> None:
     robot = SlowRobot((-0.05, 0.0, 0.0))
     robot.walk((2.0, 0.0, 0.0, 0.0), 10.0)
     assert robot.got[0] == 2.0
+    assert robot.trim.trim[0] == 0.0, "what the policy does not get is not stored, either"
+    robot.walk((1.9, 0.0, 0.0, 0.0), TICK_S)
+    assert robot.got[0] == 1.9
 
 
 def test_the_trim_fades_while_the_command_changes_and_ends_in_stance() -> None:

@@ -10,6 +10,7 @@ import attrs
 import numpy as np
 import pytest
 
+from benchmarks.why.walks import Defect, RecordedWalk
 from quadvel_bringup import cli
 from quadvel_policy.imported.importer import Supplement
 from quadvel_policy.policy_file import PolicyFile
@@ -20,6 +21,7 @@ from quadvel_why.links.contract import Gains
 from quadvel_why.links.drives import JammedJoint, SpeedTorqueLimit, TorqueLimit, WeakDrive
 from quadvel_why.links.ground import Payload, RoughGround, Slipping, SteepGround
 from quadvel_why.page import page
+from quadvel_why.policy_replay import PolicyReplay
 from quadvel_why.reading import read_run
 from quadvel_why.report import summary
 from quadvel_why.run import Commands, Modes, Run
@@ -187,6 +189,21 @@ def test_another_scale_of_the_actions_is_named(run: Run) -> None:
     assert found is not None
     assert found.cause.name() == "action_scale", found.measurement.sentence
     assert "0.60 times" in found.measurement.sentence
+
+
+def test_the_trim_of_a_controller_is_part_of_what_its_policy_got(tmp_path: Path) -> None:
+    recorded = RecordedWalk(Defect(), seed=5, plant={"payload": 8.0})
+    assert recorded.run([((0.8, 0.0, 0.0), 4.0)])
+    run = read_run(recorded.messages.write(tmp_path / "walk.mcap"))
+
+    def error(changed: Run) -> float:
+        return PolicyReplay(changed, PolicyFile(ALIENGO)).base.error
+
+    assert run.trim is not None
+    assert np.ptp(run.trim.value[:, 0]) > 0.01
+    other = attrs.evolve(run.trim, value=run.trim.value + np.array([0.1, 0.0, 0.0]))
+    assert error(run) < 0.25 * error(attrs.evolve(run, trim=None))
+    assert error(run) < 0.25 * error(attrs.evolve(run, trim=other))
 
 
 def test_what_a_recording_lacks_is_told_and_not_guessed(run: Run) -> None:

@@ -1,6 +1,7 @@
 """Backup velocity that replaces a missing or wrong velocity estimate. Knows no ROS.
 
-The supervisor selects it when a guard rejects the estimate; `guards.velocity` holds those checks.
+The supervisor selects it when a guard rejects the estimate; `guards.velocity` holds those checks. The trim of
+the velocity command uses it as well (`velocity_trim`).
 """
 
 from __future__ import annotations

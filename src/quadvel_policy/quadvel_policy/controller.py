@@ -205,8 +205,11 @@ class Controller(Node):
             refused=self._refusals.total,
             **attrs.asdict(stats),
         )
-        twist = message.command
-        twist.linear.x, twist.linear.y, twist.angular.z = supervisor.command[:3].tolist()
+        for twist, axes in (
+            (message.command, supervisor.command[:3].tolist()),
+            (message.trim, supervisor.trim),
+        ):
+            twist.linear.x, twist.linear.y, twist.angular.z = axes
         return message
 
     def _report(self) -> None:

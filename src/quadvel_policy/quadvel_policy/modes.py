@@ -60,6 +60,8 @@ class ModeInput:
         velocity: Velocity of the trunk, body frame, (3,), m/s; None without a fresh estimate.
         command: vx, vy (m/s), wz (rad/s), stance (0 or 1), within limits, (4,).
         previous: Joint command of the previous tick.
+        filtered: Velocity of the supervisor's Kalman filter, body frame, (3,), m/s, some states old (`BATCH`);
+            None without one.
     """
 
     elapsed: float
@@ -67,6 +69,7 @@ class ModeInput:
     velocity: Array | None
     command: Array
     previous: JointCommand
+    filtered: Array | None = None
 
 
 class Mode(Protocol):
@@ -272,8 +275,8 @@ class Walk:
     """Runs the policy; its torques fade in over `blend_time` after the entry.
 
     A policy with a lower rate than the control loop runs at some ticks; its targets are held at the
-    others. Constant commands are trimmed (`velocity_trim`), but not those of an imported policy: the
-    velocity estimator was not trained on its gait.
+    others. Constant commands are trimmed (`velocity_trim`), but not those of an imported policy, with
+    which the trim was not measured.
 
     Attributes:
         inference_seconds: Duration of the last network step, s; NaN before the first.
@@ -334,7 +337,8 @@ class Walk:
         """
         assert inputs.velocity is not None  # the supervisor does not walk without one
         state, velocity = inputs.state, inputs.velocity
-        command = self._trim.apply(inputs.command, velocity, float(state.angular_velocity[2]))
+        measured = velocity if inputs.filtered is None else inputs.filtered
+        command = self._trim.apply(inputs.command, measured, float(state.angular_velocity[2]))
         if self._held_ticks == self._ticks_per_step:
             observation = self._observer.observe(state, velocity, command, self._previous_action)
             start = time.perf_counter()

@@ -105,7 +105,8 @@ class Supervisor:
             robot: The robot.
             policy: The policy that walks; None: the robot stands up, stands and lies down only.
             config: Gains, durations and limits; None for the defaults.
-            backup: Filter that replaces a missing or wrong velocity estimate; None for none.
+            backup: Filter that replaces a missing or wrong velocity estimate, and whose velocity the trim uses
+                (`velocity_trim`; without it that of the estimate); None for none.
             guards: Guard classes, in priority order.
 
         Raises:
@@ -245,7 +246,9 @@ class Supervisor:
         if now.mode == "walk" and now.speed > MIN_STEPPING_SPEED:
             self.command[3] = 0.0
         elapsed = 0.0 if self._entered_at is None else state.time - self._entered_at
-        mode_input = ModeInput(elapsed, state, velocity, self.command, self._previous_answer)
+        mode_input = ModeInput(
+            elapsed, state, velocity, self.command, self._previous_answer, self._backup.velocity
+        )
         if self._walk and self._config.reset_gap < guard_input.gap <= self._config.guards.silence_limit:
             self._walk.reset()
         self._follow_table(mode_input)

@@ -1,7 +1,8 @@
-"""Trim of a constant velocity command, so that the mean of the estimated velocity reaches it.
+"""Trim of a constant velocity command, so that the mean of the velocity reaches it.
 
 A policy walks a little slower, faster or sideways on drives and ground that its training did not have.
-The trim removes that steady error: it adds the integral of the error to the command. Knows no ROS.
+The trim removes that steady error: it adds the integral of the error to the command. The velocity is that
+of the controller's Kalman filter, which needs no training on that ground. Knows no ROS.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ class VelocityTrim:
     With the command c and its low-pass s (SETTLING_S), the estimated velocity v and the trim i, all of
     (vx, vy, wz):
 
-        i' = (c - v) / INTEGRATION_S  where |c - s| <= SETTLED on all axes, |i| <= bound
+        i' = (c - v) / INTEGRATION_S  where |c - s| <= SETTLED on all axes
         i' = -i / INTEGRATION_S       elsewhere: the command changes
         i  = 0                        in stance, or for a zero velocity: the robot brakes
 
-    The policy gets c + i, within its limits.
+    with |i| <= bound and c + i within the limits of the policy, which gets c + i.
 
     Attributes:
         trim: The present trim i of vx, vy (m/s) and wz (rad/s).
@@ -65,7 +66,7 @@ class VelocityTrim:
 
         Args:
             command: vx, vy (m/s), wz (rad/s), stance (0 or 1), within limits, (4,).
-            velocity: Estimated velocity of the trunk, body frame, (3,), m/s.
+            velocity: Velocity of the trunk by the Kalman filter, body frame, (3,), m/s.
             yaw_rate: Measured turn rate, body frame, rad/s.
 
         Returns:
@@ -85,8 +86,9 @@ class VelocityTrim:
             ix, iy, iz = (min(max(i, -self._bound), self._bound) for i in trim)
         else:
             ix, iy, iz = (i * self._decay for i in self.trim)
-        self.trim = ix, iy, iz
-        return np.array([*self._limits.clamp((vx + ix, vy + iy, wz + iz)), stance])
+        px, py, pz = self._limits.clamp((vx + ix, vy + iy, wz + iz))
+        self.trim = px - vx, py - vy, pz - wz
+        return np.array([px, py, pz, stance])
 
     def _follow(self, wanted: Axes) -> float:
         """Update the low-pass of the command; return the command's largest distance from it, m/s or rad/s."""

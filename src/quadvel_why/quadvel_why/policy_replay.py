@@ -20,7 +20,6 @@ from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.observation import JOINTS, build_observation
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import MIN_STEPPING_SPEED, STANCE_COMMAND
-from quadvel_policy.velocity_trim import VelocityTrim
 
 from .run import SAME_INSTANT_S, Run
 
@@ -142,7 +141,7 @@ class PolicyReplay:
     def __init__(self, run: Run, policy: PolicyFile) -> None:
         self._run, self.policy = run, policy
         self.ticks = self._policy_ticks()
-        self._prepared: dict[tuple[int, float], NDArray[np.float32]] = {}
+        self._prepared: dict[int, NDArray[np.float32]] = {}
 
     @property
     def is_usable(self) -> bool:
@@ -212,15 +211,7 @@ class PolicyReplay:
     @cached_property
     def base(self) -> Replay:
         """The replay with the unchanged policy and observation."""
-        return self._trimmed_base[1]
-
-    @cached_property
-    def _trimmed_base(self) -> tuple[float, Replay]:
-        """Bound of the controller's trim (0 if it had none) that reproduces the commands best, and the base with it."""
-        usual = SupervisorConfig().max_velocity_trim
-        bases = {most: self._replay(Variant("as the file says"), None, most) for most in (usual, 0.0)}
-        most = 0.0 if bases[0.0].error < bases[usual].error else usual
-        return most, bases[most]
+        return self.run(Variant("as the file says"))
 
     @cached_property
     def _fault_time(self) -> float:
@@ -250,7 +241,7 @@ class PolicyReplay:
             | (power > NEAR_LIMIT * limits.max_power)
         )
 
-    def _observations(self, late: int, max_trim: float) -> NDArray[np.float32]:
+    def _observations(self, late: int) -> NDArray[np.float32]:
         """Observations of all ticks without the previous actions, (k, 48)."""
         run = self._run
         assert run.imu is not None
@@ -259,19 +250,27 @@ class PolicyReplay:
         velocity = run.estimate.value[self._velocity_rows]
         command = self._velocity_commands.copy()
         command[np.linalg.norm(velocity, axis=1) > MIN_STEPPING_SPEED, 3] = 0.0
-        turning = run.imu.angular_velocity[rows]
-        trim = VelocityTrim(self.policy.metadata.limits, max_trim)
-        trimmed = [trim.apply(*now) for now in zip(command, velocity, turning[:, 2].tolist(), strict=True)]
         return build_observation(
             self.policy.metadata.observation,
-            command=trimmed,
+            command=self._trimmed(command),
             quaternion=run.imu.quaternion[rows],
             q=run.q[rows],
             dq=run.dq[rows],
             linear_velocity=velocity,
-            angular_velocity=turning,
+            angular_velocity=run.imu.angular_velocity[rows],
             previous_action=np.zeros((len(rows), JOINTS)),
         )
+
+    def _trimmed(self, command: Array) -> Array:
+        """Add the reported trim, between reports interpolated, to the commands of all ticks, (k, 4)."""
+        reports = self._run.trim
+        if reports is None:
+            return command
+        answered = self._run.time[self._run.commands.answers[self.ticks]]
+        trim = [np.interp(answered, reports.time, axis) for axis in reports.value.T]
+        trimmed = command.copy()
+        trimmed[:, :3] += np.where(command[:, 3:] < 0.5, np.array(trim).T, 0.0)
+        return trimmed
 
     def run(self, variant: Variant, most: int | None = None) -> Replay:
         """Replay the walk: the observations of the recording with the actions of the replay.
@@ -283,13 +282,10 @@ class PolicyReplay:
         Returns:
             The replay.
         """
-        return self._replay(variant, most, self._trimmed_base[0])
-
-    def _replay(self, variant: Variant, most: int | None, max_trim: float) -> Replay:
-        meta, ticks, prepared = self.policy.metadata, self.ticks[:most], (variant.late, max_trim)
-        if prepared not in self._prepared:
-            self._prepared[prepared] = self._observations(*prepared)
-        observations = self._prepared[prepared]
+        meta, ticks = self.policy.metadata, self.ticks[:most]
+        if variant.late not in self._prepared:
+            self._prepared[variant.late] = self._observations(variant.late)
+        observations = self._prepared[variant.late]
         term = next(term for term in meta.observation.terms if term.name == "previous_action")
         own = term_slice(meta.observation, term.name)
         bound = np.inf if term.clip is None else term.clip

@@ -169,6 +169,8 @@ def _other_series(found: Messages, start: float) -> dict[str, Any]:
         )
     if reports := found["controller"]:
         given["effective_command"] = _series(reports, start, lambda m: [*planar(m.command), float(m.stance)])
+        if hasattr(reports[0], "trim"):  # older recordings lack it: their controller had no trim
+            given["trim"] = _series(reports, start, lambda m: planar(m.trim))
         time = np.array([seconds(m.stamp) - start for m in reports])
         given["modes"] = Modes(time, tuple(m.mode_name for m in reports), tuple(m.fault for m in reports))
     if found["motors"]:

@@ -121,6 +121,8 @@ class Run:
         estimate: Estimated velocity of the trunk, body frame, (k, 3), m/s; None if not recorded.
         velocity_command: vx, vy (m/s), wz (rad/s) and 1 to stand, (k, 4), before the limits of the policy.
         effective_command: The same after these limits, as the controller reports it.
+        trim: What the controller adds to vx, vy (m/s) and wz (rad/s) of a constant command, (k, 3); None if not
+            recorded.
         modes: Modes of the controller; None if not recorded.
         temperature: Temperatures of the motors, (k, J), deg C; None if not recorded.
         is_own: Whether the robot is the one of `quadvel_description`, so that its kinematics are known.
@@ -139,6 +141,7 @@ class Run:
     estimate: Series | None = None
     velocity_command: Series | None = None
     effective_command: Series | None = None
+    trim: Series | None = None
     modes: Modes | None = None
     temperature: Series | None = None
     is_own: bool = False

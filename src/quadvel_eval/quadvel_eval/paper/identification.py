@@ -16,6 +16,7 @@ from typing_extensions import override
 from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot, load_robot
 from quadvel_description.state import JointCommand, RobotState
+from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_policy.observation import VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
@@ -132,7 +133,8 @@ def record_mixed_walk(setup: Setup, seed: int, bounds: VelocityCommandLimits) ->
     simulator = RecordingSimulator(SimulatorConfig(**{"robot": robot, "seed": seed, **setup.plant}))
     simulator.reset("stand")
     estimator = make_estimator(setup.estimator, simulator, setup.estimator_file)
-    loop = RobotLoop(simulator, Supervisor(robot, PolicyFile(robot, setup.policy)), estimator)
+    supervisor = Supervisor(robot, PolicyFile(robot, setup.policy), backup=KalmanEstimator(robot))
+    loop = RobotLoop(simulator, supervisor, estimator)
     loop.start_walking()
     start = simulator.time
     fast, aside, turn = bounds.high
