@@ -81,6 +81,20 @@ def test_more_names_than_joints_are_the_mistake_not_the_column(tmp_path: Path) -
         read_log(tmp_path / "log.npz", names=ColumnMap(joints=("knee", "hip")))
 
 
+@pytest.mark.parametrize("entries", [{}, {"q": Source(("q",)), "q_des": Source(("q_des",))}])
+def test_names_of_a_map_that_contradict_those_of_the_columns_are_refused(
+    entries: dict[str, Source], tmp_path: Path
+) -> None:
+    columns = {f"{name}/{joint}": STILL for name in ("q", "q_des") for joint in ("hip", "knee")}
+    np.savez(tmp_path / "log.npz", t=np.arange(len(STILL)) / 200.0, **columns)
+    for names in (("a", "b"), ("hip", "ankle"), ("hip", "knee", "ankle"), ("hip",)):
+        with pytest.raises(LogError, match=r"joint_names: found .* are of hip, knee"):
+            read_log(tmp_path / "log.npz", names=ColumnMap(entries, joints=names))
+    for names in (("knee", "hip"), ("hip_joint", "knee_joint"), ()):
+        log = read_log(tmp_path / "log.npz", names=ColumnMap(entries, joints=names))
+        assert sorted(log.joints) == ["hip_joint", "knee_joint"]
+
+
 def test_times_of_each_joint_are_no_matter_of_names(tmp_path: Path) -> None:
     given = {name: fields()[name] for name in ("q", "dq", "q_des", "tau", "joint_names")}
     np.savez(tmp_path / "log.npz", **given, t=np.tile(fields()["t"][:, None], 12))

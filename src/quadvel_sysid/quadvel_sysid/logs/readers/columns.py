@@ -32,7 +32,7 @@ from quadvel_description.arrays import Floats
 from quadvel_description.bounded_yaml import read_yaml
 
 from ..findings import format_names
-from ..log import LogError
+from ..log import LogError, joint_name
 from . import files
 from .names import ALL_JOINTS, FIELDS, JOINT_NAMES_FIELD, resolve_columns
 from .raw import RawArrays
@@ -200,9 +200,15 @@ def read_fields(path: Path, names: ColumnMap) -> tuple[dict[str, Floats], list[s
             elif source.columns:
                 columns, own = _mapped_columns(place, name, source.columns, raw, joints)
                 fields[name] = _stack_columns(place, name, columns, raw, source.scale, remarks)
-                joints = joints or (own if name == "q" else None)
+                joints = own if own and name == "q" else joints
         if is_log_file:
             joints = _add_unmapped(place, raw, names, fields, joints, remarks)
+    if names.joints and set(map(joint_name, names.joints)) != set(map(joint_name, joints or ())):
+        raise LogError(
+            f"{path}: joint_names: found {format_names(names.joints)} in the map file, but the columns of q are of "
+            f"{format_names(joints)}; expected these names, or a list of columns for each field, such as "
+            "q: [column_1, column_2]"
+        )
     return fields, joints, remarks
 
 
