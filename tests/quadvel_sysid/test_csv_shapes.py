@@ -185,8 +185,8 @@ def test_degrees_become_radians_and_a_map_overrides_them(tmp_path: Path) -> None
         ("# only\n# comments\n", "expected"),
         ("t,q/knee,q_des/knee\n" + "1,nan,2\n" * 20, "q: no row holds a number"),
         (
-            "t,q/hip,q/knee,q_des/hip,q_des/knee\n" + "1,1,nan,2,2\n" * 20,
-            "q/knee: no number, leave out this joint",
+            "t,q/hip,q/knee,q_des/hip,q_des/knee\n" + "1,1,nan,nan,2\n" * 20,
+            "q: no joint holds a number in all of q, q_des",
         ),
     ],
 )  # fmt: skip
@@ -194,6 +194,18 @@ def test_a_table_that_is_none_is_refused_by_line_and_column(tmp_path: Path, text
     (tmp_path / "log.csv").write_text(text)
     with pytest.raises(LogError, match=rf"log\.csv: .*{sentence}"):
         read_log(tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize("field", ["q", "tau"])
+def test_a_joint_that_was_never_measured_is_left_out_by_name(field: str, tmp_path: Path) -> None:
+    lost = np.where(np.arange(2) == 1, np.nan, 0.1)
+    fields = {name: np.tile(lost if name == field else [0.1, 0.2], (60, 1)) for name in ("q", "q_des", "tau")}
+    np.savez(tmp_path / "log.npz", t=T[:60], kp=np.array([20.0, 30.0]), joint_names=["hip", "knee"], **fields)
+    log = read_log(tmp_path / "log.npz")
+    assert log.joints == ("hip_joint",)
+    assert log.kp is not None
+    assert (log.kp == 20.0).all()
+    assert [text for text in log.remarks if text.startswith(f"{field}: no number for knee_joint")]
 
 
 def bare_rows(separator: str = ",", number: Callable[[float], str] = str) -> list[str]:

@@ -203,7 +203,7 @@ def read_fields(path: Path, names: ColumnMap) -> tuple[dict[str, Floats], list[s
                 joints = own if own and name == "q" else joints
         if is_log_file:
             joints = _add_unmapped(place, raw, names, fields, joints, remarks)
-    if names.joints and set(map(joint_name, names.joints)) != set(map(joint_name, joints or ())):
+    if names.joints and joints and set(map(joint_name, names.joints)) != set(map(joint_name, joints)):
         raise LogError(
             f"{path}: joint_names: found {format_names(names.joints)} in the map file, but the columns of q are of "
             f"{format_names(joints)}; expected these names, or a list of columns for each field, such as "
@@ -320,12 +320,10 @@ def _stack_columns(
     values = np.stack(parts, 1) if len(columns) > 1 or of_joints else parts[0]
     if scale is not None:
         values = values * np.asarray(scale)
-    if values.ndim and len(values) and not count_whole_rows(values):
-        empty = np.flatnonzero(np.isnan(values).all(axis=0)).tolist() if values.ndim == 2 else []
-        which = format_names([columns[k] if len(columns) > 1 else f"column {k}" for k in empty])
-        lost = f"; {which}: no number, leave out this joint in all fields" if empty else ""
+    measured = values[:, ~np.isnan(values).all(axis=0)] if values.ndim == 2 else values
+    if values.ndim and len(values) and not count_whole_rows(measured):
         raise LogError(
-            f"{path}: {field}: no row holds a number for each joint, {len(values)} rows are not finite{lost}"
+            f"{path}: {field}: no row holds a number for each joint, {len(values)} rows are not finite"
         )
     return values
 
@@ -337,8 +335,10 @@ def count_whole_rows(values: Floats) -> int:
         values: (N,) or (N, J) values.
 
     Returns:
-        The number of rows; 0 if a value is missing in each.
+        The number of rows; 0 if a value is missing in each, or if there is no joint.
     """
+    if not values.size:
+        return 0
     missing = np.isnan(values)
     whole = np.flatnonzero(~(missing if missing.ndim == 1 else missing.any(axis=1)))
     return int(whole[-1]) + 1 if whole.size else 0

@@ -14,6 +14,7 @@ import numpy as np
 from quadvel_description.arrays import Bools, Floats
 from quadvel_description.quadruped import JOINT_NAMES
 
+from ..findings import format_names
 from ..log import Log, LogError, joint_name
 from .columns import UNUSED, ColumnMap, count_whole_rows, read_fields
 from .raw import check_size
@@ -55,7 +56,36 @@ def read_table(path: Path, names: ColumnMap) -> Log:
             f"{f'; {pickled}' if pickled else more}{EXPECTED_COMMANDS if missing == 'q_des' else ''}"
         )
     remarks = [one for one in remarks if one != pickled]
+    fields, joints = _drop_unmeasured(path, fields, joints, remarks)
     return _log(path, _cut_incomplete_rows(path, fields, remarks), joints, remarks)
+
+
+def _drop_unmeasured(
+    path: Path, fields: Mapping[str, Any], joints: list[str] | None, remarks: list[str]
+) -> tuple[dict[str, Any], list[str] | None]:
+    """Drop the joints without a number in one of the fields, in all fields; return fields and joints."""
+    shape = np.shape(fields["q"])
+    of_joints = [
+        name for name, values in fields.items() if np.ndim(values) == 2 and np.shape(values)[1:] == shape[1:]
+    ]
+    empty = {name: np.isnan(fields[name]).all(axis=0) for name in of_joints if len(fields[name])}
+    if len(shape) != 2 or not any(one.any() for one in empty.values()):
+        return dict(fields), joints
+    names = _joints(path, joints, shape[1], remarks)
+    for field, one in empty.items():
+        if one.any():
+            without = format_names([names[k] for k in np.flatnonzero(one)])
+            remarks.append(f"{field}: no number for {without}, which is left out in all fields")
+    keep = ~np.any(list(empty.values()), axis=0)
+    if not keep.any():
+        raise LogError(f"{path}: q: no joint holds a number in all of {', '.join(of_joints)}")
+
+    def select(values: Any) -> Any:
+        own = np.ndim(values) in (1, 2) and np.shape(values)[-1:] == shape[1:]
+        return values[..., keep] if own else values
+
+    kept = {name: values if name in ("t", "t_cmd") else select(values) for name, values in fields.items()}
+    return kept, [name for name, one in zip(names, keep, strict=True) if one]
 
 
 def drop_repeated_times(
