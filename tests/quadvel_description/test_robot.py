@@ -94,6 +94,9 @@ def test_tables_cannot_be_changed_by_accident():
         {"armature": [0.0, 0.0, -0.01]},
         {"lie_q": [0.0, 9.0, -1.0]},
         {"foot_radius": 25.0},
+        {"suspended_height": 800.0},
+        {"velocity_limit": 1200.0},
+        {"armature": 150.0},
         {"name": "fourth"},
     ],
 )

@@ -135,16 +135,24 @@ def _per_joint(value: Any) -> Any:
 
 
 def _joints(
-    description: str, default: Any = attrs.NOTHING, *, at_least: float = -np.inf, above: float = -np.inf
+    description: str,
+    default: Any = attrs.NOTHING,
+    *,
+    at_least: float = -np.inf,
+    above: float = -np.inf,
+    at_most: float = np.inf,
 ) -> Any:
     """Declare a field with a number for each joint."""
-    limit = "" if at_least == -np.inf else f", at least {at_least:g}"
-    limit = limit if above == -np.inf else f", above {above:g}"
+    bounds = (("at least", at_least), ("above", above), ("at most", at_most))
+    limit = "".join(f", {word} {bound:g} {description}" for word, bound in bounds if np.isfinite(bound))
 
     def check(robot: object, attribute: attrs.Attribute[Any], value: Any) -> None:
         """Refuse anything but twelve finite numbers within the limits."""
         is_vector = isinstance(value, np.ndarray) and value.shape == (len(JOINT_NAMES),)
-        if not is_vector or not (np.isfinite(value) & (value >= at_least) & (value > above)).all():
+        in_range = is_vector and np.isfinite(value) & (value >= at_least) & (value > above) & (
+            value <= at_most
+        )
+        if not np.all(in_range):
             expected = f"1, 3 (hip, thigh, calf) or 12 finite numbers{limit}"
             raise refusal(robot, attribute.name, value, expected)
 
@@ -254,10 +262,10 @@ class Robot:
     kd: float = positive()
     nominal_q: Array = _joints("stance, rad")
     lie_q: Array = _joints("lying, rad")
-    suspended_height: float = positive()
+    suspended_height: float = positive(at_most=5.0)
     torque_limit: Array = _joints("N m", above=0.0)
-    velocity_limit: Array = _joints("rad/s", above=0.0)
-    armature: Array = _joints("kg m^2", at_least=0.0)
+    velocity_limit: Array = _joints("rad/s", above=0.0, at_most=100.0)
+    armature: Array = _joints("kg m^2", at_least=0.0, at_most=1.0)
     joint_friction: Array = _joints("N m", at_least=0.0)
     joint_damping: Array = _joints("N m s/rad", at_least=0.0)
     foot_radius: float = positive(at_most=0.1)
