@@ -15,7 +15,8 @@ from quadvel_driver.link import Link
 from quadvel_driver.udp import UdpConfig, UdpTransport
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_policy.config import SupervisorConfig
-from quadvel_policy.control_loop import RATE_HZ, WATCH_PERIOD_S, ControlConfig, ControlLoop
+from quadvel_policy.control_loop import WATCH_PERIOD_S, ControlConfig, ControlLoop
+from quadvel_policy.observation import RATE_HZ
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.bad_network import NetworkConfig

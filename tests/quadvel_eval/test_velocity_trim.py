@@ -6,8 +6,9 @@ import numpy as np
 
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_eval.paper.gap import drive_conditions
-from quadvel_eval.robot_loop import CONTROL_PERIOD_S, RobotLoop, make_estimator
+from quadvel_eval.robot_loop import RobotLoop, make_estimator
 from quadvel_policy.config import SupervisorConfig
+from quadvel_policy.observation import CONTROL_PERIOD_S
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig

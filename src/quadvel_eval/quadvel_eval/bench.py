@@ -32,13 +32,14 @@ from quadvel_driver.board_state import BoardState
 from quadvel_driver.unitree_dds import wire as dds_wire
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_nodes.number_text import number_text
+from quadvel_policy.observation import CONTROL_PERIOD_S
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import TickInput
 from quadvel_sim import Simulator, SimulatorConfig, World
 
 from . import round_trip
-from .robot_loop import CONTROL_PERIOD_S, SIMULATOR_STEPS_PER_TICK, RobotLoop, TrueVelocity
+from .robot_loop import SIMULATOR_STEPS_PER_TICK, RobotLoop, TrueVelocity
 from .walk import Setup, make_loop, make_simulator
 
 WALK_COMMAND = (0.5, 0.0, 0.0)

@@ -15,10 +15,10 @@ from scipy.ndimage import uniform_filter1d
 
 from quadvel_description.arrays import Array
 from quadvel_nodes.number_text import DASH
+from quadvel_policy.observation import CONTROL_PERIOD_S
 
 from .demo_summary import constant_commands
 from .recording import Recording, Series
-from .robot_loop import CONTROL_PERIOD_S
 
 AVERAGING_TIME_S = 0.4  # of plotted velocities, to remove the sway of each step
 AXIS_LABELS = ("vx, m/s", "vy, m/s", "wz, rad/s")

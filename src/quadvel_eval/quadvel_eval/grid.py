@@ -12,10 +12,11 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Array
+from quadvel_policy.observation import CONTROL_PERIOD_S
 from quadvel_sim.physics import HELD_OUT_PHYSICS
 
 from .pool import Call, run_in_parallel
-from .robot_loop import CONTROL_PERIOD_S, RobotLoop
+from .robot_loop import RobotLoop
 from .segments import SETTLING_TIME_S, Segment, measure_segment, response_delay, rounded, tracking_errors
 from .walk import Setup, Walk, cost_of_transport, jitter, make_loop, record_walk
 

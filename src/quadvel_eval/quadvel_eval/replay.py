@@ -21,6 +21,7 @@ from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand
 from quadvel_nodes.messages import seconds
+from quadvel_policy.observation import CONTROL_PERIOD_S
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_recordings.joint_log import JointLog, Series, require_commands
@@ -29,7 +30,7 @@ from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.simulator import DT, Simulator, Truth
 
 from .recording import Recording
-from .robot_loop import CONTROL_PERIOD_S, RobotLoop, make_estimator
+from .robot_loop import RobotLoop, make_estimator
 from .segments import SETTLING_TIME_S, Segment, measure_segment
 
 STRETCH_DURATION_S = 0.2  # of one open-loop replay

@@ -24,12 +24,11 @@ from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_estimator.tracker import Estimator
 from quadvel_policy.command_mux import CommandMux, MuxInput
-from quadvel_policy.observation import RATE_HZ
+from quadvel_policy.observation import CONTROL_PERIOD_S
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import TickInput
 from quadvel_sim.simulator import DT, Simulator, Truth
 
-CONTROL_PERIOD_S = 1.0 / RATE_HZ
 ESTIMATORS = ("learned", "kalman", "truth")
 SIMULATOR_STEPS_PER_TICK = round(CONTROL_PERIOD_S / DT)
 _PLANNER = MuxInput("planner", priority=0, timeout=1.0)

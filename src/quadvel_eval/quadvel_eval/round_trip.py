@@ -13,8 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 import quadvel_dds
-
-from .robot_loop import CONTROL_PERIOD_S
+from quadvel_policy.observation import CONTROL_PERIOD_S
 
 DISCOVERY_TIMEOUT_S = 20.0  # for the discovery of the other process
 ANSWER_TIMEOUT_S = 0.1  # after which a message counts as lost

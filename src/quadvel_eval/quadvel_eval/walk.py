@@ -22,12 +22,13 @@ from quadvel_description.robot import Robot, load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import shipped_estimator
+from quadvel_policy.observation import CONTROL_PERIOD_S
 from quadvel_policy.policy_file import load_policy, shipped_policy
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.terrain import Terrain
 
-from .robot_loop import CONTROL_PERIOD_S, RobotLoop, Sample, make_estimator
+from .robot_loop import RobotLoop, Sample, make_estimator
 
 TERRAINS = ("flat", "rough", "slope")
 SLOPE_ANGLE_RAD = 0.15  # rising ahead

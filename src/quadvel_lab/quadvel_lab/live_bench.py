@@ -40,8 +40,8 @@ from quadvel_bringup.session import Session, not_running
 from quadvel_bringup.stack import Stack
 from quadvel_description.arrays import Array
 from quadvel_eval.bench import WALK_COMMAND, Benchmark
-from quadvel_eval.robot_loop import CONTROL_PERIOD_S
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState
+from quadvel_policy.observation import CONTROL_PERIOD_S
 
 NODES = tuple(Stack().node_parameters())
 PROCESSES = (*NODES, "floor")

@@ -28,7 +28,7 @@ from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.node import run
 from quadvel_nodes.scheduling import Scheduling
-from quadvel_policy.control_loop import PERIOD_S
+from quadvel_policy.observation import CONTROL_PERIOD_S
 from quadvel_policy.policy_file import PolicyFile
 
 
@@ -54,7 +54,7 @@ class Floor(Node):
 
 
 def measure_sleep(seconds: float) -> dict[str, float]:
-    """Sleep until each deadline of a grid of PERIOD_S.
+    """Sleep until each deadline of a grid of CONTROL_PERIOD_S.
 
     Args:
         seconds: Duration, s.
@@ -63,10 +63,10 @@ def measure_sleep(seconds: float) -> dict[str, float]:
         Median and high percentiles of the lateness, us, and processor time of a period, us.
     """
     Scheduling().apply(print)
-    count, start, used = round(seconds / PERIOD_S), time.perf_counter(), time.process_time()
+    count, start, used = round(seconds / CONTROL_PERIOD_S), time.perf_counter(), time.process_time()
     late = []
     for k in range(1, count + 1):
-        deadline = start + k * PERIOD_S
+        deadline = start + k * CONTROL_PERIOD_S
         time.sleep(max(deadline - time.perf_counter(), 0.0))
         late.append(time.perf_counter() - deadline)
     used = time.process_time() - used

@@ -31,13 +31,12 @@ from quadvel_nodes.tick_grid import TickGrid
 from .config import SupervisorConfig
 from .guard import FALL_TIME_S
 from .loop_stats import LoopStats
-from .observation import RATE_HZ
+from .observation import CONTROL_PERIOD_S
 from .received import StampCheck
 from .stall_detector import StallDetector
 from .supervisor import Supervisor
 from .tick_input import TickInput
 
-PERIOD_S = 1.0 / RATE_HZ
 WATCH_PERIOD_S = 0.02
 """s between two calls of `watch`."""
 MAX_STALL_S = 0.5
@@ -137,7 +136,7 @@ class ControlLoop:
         """
         self.supervisor = supervisor
         self.stats = LoopStats()
-        self.stall_detector = StallDetector(WATCH_PERIOD_S, PERIOD_S)
+        self.stall_detector = StallDetector(WATCH_PERIOD_S, CONTROL_PERIOD_S)
         self.inputs = TickInput()
         self._guards = config.supervisor.guards
         self._config, self._publish, self._sim_time = config, answer, sim_time
@@ -146,10 +145,10 @@ class ControlLoop:
         self._velocity_lead = (
             math.inf if self._guards.robot_waits else 0.0
         )  # s, by which a velocity may be ahead of the state during a stall
-        self._robot_time, self._grid = StallFreeClock(), TickGrid(PERIOD_S)
+        self._robot_time, self._grid = StallFreeClock(), TickGrid(CONTROL_PERIOD_S)
         self._waiting_state: RobotState | None = None  # the state that waits for estimator or mux
         max_wait = LOCKSTEP_WAIT_S if sim_time else MAX_STALL_S
-        self._estimator = _LaggingNode(1.5 * PERIOD_S, max_wait)
+        self._estimator = _LaggingNode(1.5 * CONTROL_PERIOD_S, max_wait)
         self._mux = _LaggingNode(0.5 * config.command_timeout if sim_time else math.inf, max_wait)
         self._answer = JointCommand.damping()
         self._velocity: Stamped | None = None
@@ -290,7 +289,7 @@ class ControlLoop:
         if periods:
             self._tick(state, now)
             compute = time.perf_counter() - start
-            late = self._now() - self.stalled - state.time > PERIOD_S
+            late = self._now() - self.stalled - state.time > CONTROL_PERIOD_S
             self.stats.add(start, compute, self.supervisor.inference_seconds, periods - 1 + late)
             self.supervisor.run_deferred()
         elif self._sim_time:  # a simulator in lockstep waits for the answer to each of its states

@@ -27,6 +27,7 @@ from quadvel_description.robot_name import UNNAMED_ROBOT
 from quadvel_description.state import RobotState
 
 RATE_HZ = 200.0
+CONTROL_PERIOD_S = 1.0 / RATE_HZ
 JOINTS = len(JOINT_NAMES)
 COMMAND_AXES = ("vx", "vy", "wz")
 OBSERVATION_SIZES = {

@@ -13,7 +13,7 @@ import numpy as np
 
 from quadvel_description.arrays import Array
 
-from .observation import RATE_HZ, VelocityCommandLimits
+from .observation import CONTROL_PERIOD_S, VelocityCommandLimits
 
 SETTLING_S = 0.5
 """Time constant after which the robot counts as having followed a change of the command."""
@@ -23,7 +23,6 @@ INTEGRATION_S = 1.0
 """Time constant of the integral, and of its decay while the command changes; twice SETTLING_S, so that the
 loop through the robot does not oscillate.
 """
-TICK_S = 1.0 / RATE_HZ
 
 Axes = tuple[float, float, float]
 ZERO: Axes = (0.0, 0.0, 0.0)
@@ -53,8 +52,8 @@ class VelocityTrim:
             bound: Largest trim of each axis, m/s and rad/s; 0: commands are not changed.
         """
         self._limits, self._bound = limits, bound
-        self._settling_share = 1.0 - math.exp(-TICK_S / SETTLING_S)
-        self._decay = math.exp(-TICK_S / INTEGRATION_S)
+        self._settling_share = 1.0 - math.exp(-CONTROL_PERIOD_S / SETTLING_S)
+        self._decay = math.exp(-CONTROL_PERIOD_S / INTEGRATION_S)
         self.reset()
 
     def reset(self) -> None:
@@ -82,7 +81,7 @@ class VelocityTrim:
             return command
         if distance <= SETTLED:
             errors = vx - float(velocity[0]), vy - float(velocity[1]), wz - yaw_rate
-            trim = (i + e * TICK_S / INTEGRATION_S for i, e in zip(self.trim, errors, strict=True))
+            trim = (i + e * CONTROL_PERIOD_S / INTEGRATION_S for i, e in zip(self.trim, errors, strict=True))
             ix, iy, iz = (min(max(i, -self._bound), self._bound) for i in trim)
         else:
             ix, iy, iz = (i * self._decay for i in self.trim)

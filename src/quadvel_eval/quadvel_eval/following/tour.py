@@ -22,12 +22,12 @@ from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, Plan, State
 from quadvel_follow.pose_history import PoseHistory
+from quadvel_policy.observation import CONTROL_PERIOD_S as TICK
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.world import World
 
-from ..robot_loop import CONTROL_PERIOD_S as TICK
 from ..robot_loop import RobotLoop, Sample, make_estimator
 from ..segments import rounded
 from .follower import Follower

@@ -20,9 +20,9 @@ from typing_extensions import override
 
 from quadvel_description.arrays import Array, Bools
 from quadvel_description.quadruped import LEGS
+from quadvel_policy.observation import CONTROL_PERIOD_S
 
 from ..gait_kind import GaitKind, gait_frequency
-from ..robot_loop import CONTROL_PERIOD_S
 from ..walk import Setup, Walk, make_loop, record_until_fall
 from .section import (
     Job,

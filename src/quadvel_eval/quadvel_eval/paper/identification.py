@@ -17,7 +17,7 @@ from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import Robot, load_robot
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator.kalman import KalmanEstimator
-from quadvel_policy.observation import VelocityCommandLimits
+from quadvel_policy.observation import CONTROL_PERIOD_S, VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
@@ -25,7 +25,7 @@ from quadvel_sysid.excitation import FootLifting, limit_torque
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log
 
-from ..robot_loop import CONTROL_PERIOD_S, SIMULATOR_STEPS_PER_TICK, RobotLoop, make_estimator
+from ..robot_loop import SIMULATOR_STEPS_PER_TICK, RobotLoop, make_estimator
 from ..walk import Setup, record_until_fall
 from .cells import command_limits
 from .section import Job, JobResults, Record, Row, Section, Study, column, select

@@ -15,8 +15,8 @@ from typing_extensions import override
 
 from quadvel_description.arrays import Array
 from quadvel_follow.trajectory import SHIPPED_FOLDER, Trajectory, read_table
+from quadvel_policy.observation import CONTROL_PERIOD_S
 
-from ..robot_loop import CONTROL_PERIOD_S
 from ..walk import Setup, Walk, make_loop, record_until_fall
 from .cells import Command
 from .section import (

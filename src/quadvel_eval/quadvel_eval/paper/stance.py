@@ -16,10 +16,11 @@ from typing_extensions import override
 
 from quadvel_description.arrays import Array
 from quadvel_description.state import JointCommand
+from quadvel_policy.observation import CONTROL_PERIOD_S
 
 from ..gait_kind import touchdowns
 from ..grid import WALK_BEFORE_STANCE, max_displacement
-from ..robot_loop import CONTROL_PERIOD_S, SIMULATOR_STEPS_PER_TICK, RobotLoop
+from ..robot_loop import SIMULATOR_STEPS_PER_TICK, RobotLoop
 from ..walk import Setup, make_loop, record_walk
 from .gait import debounce_contacts
 from .section import (

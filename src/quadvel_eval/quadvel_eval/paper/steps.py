@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from quadvel_description.arrays import Array
+from quadvel_policy.observation import CONTROL_PERIOD_S
 
-from ..robot_loop import CONTROL_PERIOD_S
 from ..walk import Setup, make_loop, record_until_fall
 from .cells import Command
 from .section import Job, JobResults, Record, Row, Section, Study, by_policy, column, distinct, mean, select

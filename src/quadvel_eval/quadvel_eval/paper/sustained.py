@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from typing_extensions import override
 
 from quadvel_description.robot import load_robot
+from quadvel_policy.observation import CONTROL_PERIOD_S
 
-from ..robot_loop import CONTROL_PERIOD_S
 from ..walk import Setup, make_loop, record_until_fall
 from .cells import Command, command_limits, count_falls, max_command_along
 from .conditions import HARD_PLANTS, PLANT_NAMES
