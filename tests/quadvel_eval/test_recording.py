@@ -67,8 +67,8 @@ def estimate(time: float, velocity: np.ndarray) -> Any:
 def controller_state(time: float, mode: str, compute_p99_us: float) -> Any:
     return TYPES["quadvel_msgs/msg/ControllerState"](
         stamp=stamp(time), mode=3, mode_name=mode, reason="", fault="", findings=[],
-        walk_allowed=True, walk_refusal="", command=twist(0.0, 0.0, 0.0),
-        trim=twist(0.0, 0.0, 0.0), stance=False, rate_hz=200.0 if mode == "walk" else 150.0, period_p99_ms=5.5, inference_p50_us=30.0,
+        walk_allowed=True, walk_refusal="", command=twist(0.0, 0.0, 0.0), trim=twist(0.0, 0.0, 0.0),
+        stance=False, rate_hz=200.0 if mode == "walk" else 150.0, period_p99_ms=5.5, inference_p50_us=30.0,
         compute_p50_us=200.0, compute_p99_us=compute_p99_us, overruns=2, refused=0,
     )  # fmt: skip
 
