@@ -28,6 +28,7 @@ from quadvel_description.state import RobotState
 
 RATE_HZ = 200.0
 CONTROL_PERIOD_S = 1.0 / RATE_HZ
+"""Time between two ticks of the controller, s."""
 JOINTS = len(JOINT_NAMES)
 COMMAND_AXES = ("vx", "vy", "wz")
 OBSERVATION_SIZES = {

@@ -81,6 +81,7 @@ def _drop_unmeasured(
         raise LogError(f"{path}: q: no joint holds a number in all of {', '.join(of_joints)}")
 
     def select(values: Any) -> Any:
+        """Keep the measured joints of an array with a column, or a constant, for each joint."""
         own = np.ndim(values) in (1, 2) and np.shape(values)[-1:] == shape[1:]
         return values[..., keep] if own else values
 
