@@ -33,7 +33,7 @@ def write(tmp_path: Path):
 
 
 def test_an_obstacle_where_the_robot_starts_is_refused(write, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="wall_0 stands where the robot starts"):
+    with pytest.raises(ValueError, match="world mine: wall_0 stands where the robot starts"):
         draw(write(WALL_AT_THE_START), tmp_path / "map.png")
     assert not (tmp_path / "map.png").exists()
 

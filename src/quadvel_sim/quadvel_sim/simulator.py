@@ -136,8 +136,11 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
     return model
 
 
-def _check_start(model: mujoco.MjModel, ground: Bools) -> None:
-    """Refuse an obstacle inside which the lying robot would start; `ground`: whether each geom is ground."""
+def _check_start(model: mujoco.MjModel, ground: Bools, world: str) -> None:
+    """Refuse an obstacle inside which the lying robot would start.
+
+    `ground`: whether each geom is ground; `world`: name of the world, for the message.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("lie").id)
     mujoco.mj_fwdPosition(model, data)
@@ -146,7 +149,8 @@ def _check_start(model: mujoco.MjModel, ground: Bools) -> None:
         robot, other = sorted(contact.geom, key=lambda geom: not moves[geom])
         if contact.dist < -MAX_START_DEPTH_M and moves[robot] and not moves[other] and not ground[other]:
             raise ValueError(
-                f"world: {model.geom(other).name} stands where the robot starts, expected room around the origin"
+                f"world {world}: {model.geom(other).name} stands where the robot starts, "
+                "expected room around the origin"
             )
 
 
@@ -194,7 +198,7 @@ class Simulator:
         self._joint_limits = [(field, field.copy()) for field in limits]
         self.reset()
         if world is not None:
-            _check_start(self.model, self._ground)
+            _check_start(self.model, self._ground, world.name)
 
     def reset(self, keyframe: str = "lie", seed: int | None = None) -> None:
         """Put the robot at the origin, at rest, with time zero and braking drives.
