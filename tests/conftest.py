@@ -52,7 +52,7 @@ if "QUADVEL_TEST_RUN" not in os.environ:  # a worker has that of its run
 RUN = os.environ["QUADVEL_TEST_RUN"]
 os.environ["ROS_DOMAIN_ID"] = str(DOMAIN_STEP * int(RUN) + WORKER % DOMAIN_STEP)
 
-# Left out where they cannot run: tests of ROS 2's tools without ROS 2, and of both middlewares beside each other
+# Left out where they cannot run: tests of ROS 2's tools without ROS 2, and of both middlewares at once
 # where there is but one.
 HAS_ROS = "AMENT_PREFIX_PATH" in os.environ or "QUADVEL_ROS_SETUP" in os.environ
 collect_ignore = [*([] if HAS_ROS else ["ros"]), *([] if find_spec("rclpy") else ["mixed"])]

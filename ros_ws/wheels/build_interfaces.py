@@ -1,6 +1,6 @@
 """Builds quadvel's interfaces for the rclpy of this Python environment, which comes from PyPI, and installs them there.
 
-ROS 2 Jazzy's rclpy and standard messages are wheels; `quadvel_msgs`, and `tf2_msgs` which nobody uploads, have to be
+ROS 2 Jazzy's rclpy and standard messages are wheels; `quadvel_msgs`, and `tf2_msgs` which has no wheel, have to be
 generated with the wheels' rosidl and compiled, for Fast DDS, the only middleware among the wheels. What was built is
 kept as a wheel below $XDG_CACHE_HOME/quadvel/interfaces (~/.cache without it), under a hash of all it is made from.
 

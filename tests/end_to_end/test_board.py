@@ -1,7 +1,7 @@
 """The robot behind the AlienGo's interface: `quadvel up --low-level board`, driven by its remote alone.
 
 Board, driver, estimator, controller and mux are processes; packets go over UDP on loopback, the rest over DDS. The operator's
-remote is a joystick at the board, so that all it does comes through the packets. A board waits for nobody, so this wants a
+remote is a joystick at the board, so that all it does comes through the packets. A board does not wait, so this needs a
 machine with time to spare: pytest -m realtime.
 """
 
@@ -138,7 +138,7 @@ def test_the_remote_stands_the_robot_up_walks_it_stops_it_and_lays_it_down(
     operator.spin_until(lambda: operator.mode == "stance")
     operator.hold(ly=0.6)
     operator.spin(1.5)
-    assert operator.mode == "stance"  # nobody allowed it to walk
+    assert operator.mode == "stance"  # it was not allowed to walk
     operator.hold()
     operator.spin(1.0)
     operator.order(OperatorCommand.ALLOW_WALKING, lambda: operator.states[-1].walk_allowed)

@@ -1,7 +1,7 @@
-"""Ten minutes of walking at 200 Hz beside a loop that only sleeps: who misses more deadlines?
+"""Ten minutes of walking at 200 Hz next to a loop that only sleeps: who misses more deadlines?
 
 `quadvel up` simulates in real time, with the priority that the nodes of a robot have; the plain loop has the same one, and runs
-beside it. Starting is left out: what counts begins when the robot walks. Wants a machine with nothing else to do:
+next to it. Starting is left out: what counts begins when the robot walks. Wants a machine with nothing else to do:
 pytest -m realtime tests/end_to_end/test_deadlines.py -s
 """
 

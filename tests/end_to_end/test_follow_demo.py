@@ -32,21 +32,21 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_robot_follows_and_touches_nothing(out: Path) -> None:
-    told = json.loads((out / "tour.json").read_text())
-    assert (told["fell"], told["touched"]) == (False, {})
-    assert told["walked"] > 2.0  # m
+    tour = json.loads((out / "tour.json").read_text())
+    assert (tour["fell"], tour["touched"]) == (False, {})
+    assert tour["walked"] > 2.0  # m
 
 
 def test_the_person_is_told_where_it_is(out: Path) -> None:
-    """As the robot sees it: what the tracker says, against the odometry, beside the truth of the same instants."""
+    """As the robot sees it: what the tracker says, against the odometry, and the truth at the same instants."""
     person = places(out, "/person/odometry", lambda m: m.pose.pose)
     robot = places(out, "/odom", lambda m: m.pose.pose)
     true_person = places(out, "/ground_truth/persons", lambda m: m.poses[0])
     true_robot = places(out, "/ground_truth/odom", lambda m: m.pose.pose)
     time = person[:, 0]
-    told = person[:, 1:3] - at(time, robot)[:, :2]
+    tracked = person[:, 1:3] - at(time, robot)[:, :2]
     true = at(time, true_person)[:, :2] - at(time, true_robot)[:, :2]
-    off = np.hypot(*told.T) - np.hypot(*true.T)
+    off = np.hypot(*tracked.T) - np.hypot(*true.T)
     assert np.median(np.abs(off)) < 0.1
 
 

@@ -51,7 +51,7 @@ class Robot:
         return self._process.poll() is None
 
     def log(self) -> str:
-        """All that it said since it was told to forget."""
+        """Everything it reported since `forget`."""
         return self._log.read_text()
 
     def forget(self) -> None:
@@ -163,8 +163,8 @@ def test_two_that_drive_at_once_are_told_so(up: Robot) -> None:
         [*QUADVEL, "drive", "--vx", "-0.3", "--seconds", "5"], stdout=subprocess.PIPE, text=True
     ) as other:
         code, text = quadvel("drive", "--vx", "0.3", "--seconds", "4")
-        told = other.communicate(timeout=60)[0]
-    for ended, said in ((code, text), (other.returncode, told)):
+        other_text = other.communicate(timeout=60)[0]
+    for ended, said in ((code, text), (other.returncode, other_text)):
         assert ended == 1, said
         assert "not followed: another program that publishes cmd_vel_teleop, too, commands the robot" in said
 

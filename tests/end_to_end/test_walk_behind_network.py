@@ -52,7 +52,7 @@ class Wire(Transport):
 
 
 class BehindNetwork:
-    """A simulator as its driver shows it: what it reports and is told goes through packets and a bad network."""
+    """A simulator as its driver shows it: its reports and commands go through packets and a bad network."""
 
     def __init__(self, network: NetworkConfig, robot: Robot, packets: Any) -> None:
         self._packets, self._robot = packets, robot

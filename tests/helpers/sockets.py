@@ -33,7 +33,7 @@ class Bound:
 
 
 def all_sockets() -> dict[str, Bound]:
-    """Those of IPv4 and IPv6 on this machine, by their inodes, as the kernel tells who asks by netlink."""
+    """Those of IPv4 and IPv6 on this machine, by their inodes, as the kernel reports them by netlink."""
     found = {}
     for family in FAMILIES:
         for protocol in PROTOCOLS:

@@ -1,4 +1,4 @@
-"""Nodes on both middlewares beside each other: those of rclpy, embedded ones, and a watcher on rclpy in this process."""
+"""Nodes on both middlewares at once: those of rclpy, embedded ones, and a watcher on rclpy in this process."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def test_ctrl_c_while_the_interpreter_ends_changes_nothing(
         text=True,
         timeout=60,
     )
-    assert ended.returncode == code, ended.stderr  # nobody is there
+    assert ended.returncode == code, ended.stderr  # no robot is there
     assert "Traceback" not in ended.stderr
 
 

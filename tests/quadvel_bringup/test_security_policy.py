@@ -25,7 +25,7 @@ KINDS = {
     ("services", "request"): "client",
 }
 
-# Makes every node, one after the other, and tells what each of them created.
+# Makes every node, one after the other, and reports what each of them created.
 PROGRAM = """
 import quadvel_dds; quadvel_dds.install()
 import inspect, json, rclpy, sys
@@ -33,13 +33,13 @@ from importlib import import_module
 from rclpy.node import Node
 
 created = {}
-def told(kind, create):
+def reporting(kind, create):
     def tell(self, interface, name, *arguments, **options):
         created.setdefault(self.get_name(), {}).setdefault(kind, []).append(name)
         return create(self, interface, name, *arguments, **options)
     return tell
 for kind in ("publisher", "subscription", "service", "client"):
-    setattr(Node, f"create_{kind}", told(kind, getattr(Node, f"create_{kind}")))
+    setattr(Node, f"create_{kind}", reporting(kind, getattr(Node, f"create_{kind}")))
 for module in map(import_module, sys.argv[1:]):
     (make,) = [one for _, one in inspect.getmembers(module, inspect.isclass)
                if issubclass(one, Node) and one.__module__ == module.__name__]

@@ -167,8 +167,8 @@ def test_the_robot_itself_stands_up_and_walks_only_on_an_operators_call() -> Non
 def test_every_node_that_has_to_know_the_robot_is_told_its_name_or_file() -> None:
     for low_level, serving in (("driver", {"driver"}), ("sim", {"sim_node"}), ("board", {"board", "driver"})):
         overrides = Stack(low_level=low_level, robot="go2").node_parameters()
-        told = {name for name, values in overrides.items() if values.get("robot") == "go2"}
-        assert told == {*serving, "estimator", "controller"}
+        robots = {name for name, values in overrides.items() if values.get("robot") == "go2"}
+        assert robots == {*serving, "estimator", "controller"}
     file = Stack(low_level="external", robot="mine/robot.yaml").node_parameters()["controller"]["robot"]
     assert file == str(Path("mine/robot.yaml").resolve())
 
@@ -180,8 +180,8 @@ def test_the_folder_of_a_robot_may_be_named_but_hides_no_shipped_one(
     for name in ("mine", "go2"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "robot.yaml").touch()
-    told = [Stack(robot=name).node_parameters()["estimator"]["robot"] for name in ("mine", "go2", "spot")]
-    assert told == [str(tmp_path / "mine"), "go2", "spot"]
+    robots = [Stack(robot=name).node_parameters()["estimator"]["robot"] for name in ("mine", "go2", "spot")]
+    assert robots == [str(tmp_path / "mine"), "go2", "spot"]
 
 
 def test_what_a_robot_cannot_do_is_refused_by_name() -> None:

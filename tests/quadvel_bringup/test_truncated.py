@@ -1,4 +1,4 @@
-"""Recordings that were cut off, as the command line tells of them."""
+"""Recordings that were cut off, as the command line reports them."""
 
 from __future__ import annotations
 

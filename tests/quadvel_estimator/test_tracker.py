@@ -19,7 +19,7 @@ MOVING = np.ones(12)
 
 
 class Scripted:
-    """Tells one velocity and remembers what it was asked."""
+    """Returns one velocity and remembers its inputs."""
 
     def __init__(self) -> None:
         self.velocity = np.array([1.0, 0.0, 0.0])

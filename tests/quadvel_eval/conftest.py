@@ -53,8 +53,8 @@ def make_loop() -> Callable[..., RobotLoop]:
     def make(seed: int = 0) -> RobotLoop:
         simulator = Simulator(SimulatorConfig(robot=ALIENGO, seed=seed))
         simulator.reset("stand")
-        beside = {"kalman": KalmanEstimator(ALIENGO)}
-        loop = RobotLoop(simulator, Supervisor(ALIENGO, StandingPolicy()), TrueVelocity(simulator), beside)
+        others = {"kalman": KalmanEstimator(ALIENGO)}
+        loop = RobotLoop(simulator, Supervisor(ALIENGO, StandingPolicy()), TrueVelocity(simulator), others)
         loop.start_walking()
         return loop
 

@@ -111,7 +111,7 @@ def test_table_shows_falls_and_the_worst_cell() -> None:
     assert "0.5, 0, 0" in text
 
 
-@pytest.mark.parametrize("folder", ["/proc", "/sys"])  # where nobody can write, root neither
+@pytest.mark.parametrize("folder", ["/proc", "/sys"])  # where no user can write, not even root
 def test_an_unwritable_folder_fails_before_the_work(folder: str) -> None:
     with pytest.raises(OSError, match=rf"^{folder}: the folder can't be written: "):
         output_folder(Path(folder))

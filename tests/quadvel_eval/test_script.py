@@ -9,7 +9,7 @@ WALK = Drive("forward", (0.5, 0.0, 0.0), 2.0)
 
 def test_a_script_is_walked_step_by_step() -> None:
     runner = ScriptRunner((STAND_UP, WALK, LIE_DOWN))
-    assert runner.update(0.0, "").requested_mode is None  # nobody is there to be ordered
+    assert runner.update(0.0, "").requested_mode is None  # no robot is there to be commanded
     assert runner.update(0.1, "passive").requested_mode == "stand_up"
     assert runner.update(0.2, "stand_up").velocity is None
     assert runner.update(3.0, "stance").velocity == WALK.velocity

@@ -42,7 +42,7 @@ def test_a_person_may_be_asked_for_by_id_or_as_the_nearest_ahead() -> None:
     assert selection.select(0, tracks[1:], HERE).id == 5
     with pytest.raises(ValueError, match="id is 9, expected one that is tracked: 2, 5"):
         selection.select(9, tracks, HERE)
-    with pytest.raises(ValueError, match="nobody is ahead"):
+    with pytest.raises(ValueError, match="no person is ahead"):
         selection.select(0, tracks, (0.0, 0.0, np.pi))
 
 

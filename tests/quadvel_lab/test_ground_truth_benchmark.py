@@ -113,8 +113,8 @@ def test_the_noise_of_hidden_drives_is_that_of_the_stacks_model() -> None:
 
 def test_only_the_plants_process_is_told_of_its_file() -> None:
     nodes = plant_nodes(PLANTS / "dry_gears.yaml", seed=4)
-    told = [name for name, line in nodes.items() if any("dry_gears" in word for word in line)]
-    assert told == ["sim_node"]
+    named = [name for name, line in nodes.items() if any("dry_gears" in word for word in line)]
+    assert named == ["sim_node"]
     assert set(nodes) == {"sim_node", "estimator", "controller", "command_mux"}
     assert "seed:=4" in nodes["sim_node"]
 

@@ -459,7 +459,7 @@ def test_a_second_controller_refuses_to_start_and_another_writer_is_warned_of(ro
     robot.graph.peer.create_publisher(LowCmd, "low_cmd", 1)  # as one that was discovered too late
     robot.step(5)
     robot.graph.diagnosed("low_cmd has 2 publishers, expected 1")
-    assert robot.report("stance")  # one that only exists stops nobody
+    assert robot.report("stance")  # a silent one stops nothing
 
 
 def test_a_second_robot_on_the_same_topic_is_a_fault_and_refuses_to_be_stood_up(robot: Robot) -> None:

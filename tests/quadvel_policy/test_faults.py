@@ -510,7 +510,7 @@ def test_the_page_of_faults_is_what_the_code_prints() -> None:
 
 
 def test_a_simulated_robot_goes_on_after_states_that_were_lost(policy: Any) -> None:
-    """Nobody had time to read them on a loaded machine: only a silence of `max_standstill` is a fault there."""
+    """A loaded machine had no time to read them: only a silence of `max_standstill` is a fault there."""
     rig = Rig(policy, robot_waits=True).stand()
     rig.tick(step=0.075)
     assert rig.mode == "stance", rig.supervisor.reason

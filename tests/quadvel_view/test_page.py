@@ -95,7 +95,7 @@ def launch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str],
 
 @pytest.fixture(scope="module")
 def browser(launch: Callable[[str], Any]) -> Iterator[Any]:
-    """A browser that gets its share of the processor beside other tests."""
+    """A browser that gets its share of the processor next to other tests."""
     browser = launch("")
     yield browser
     browser.close()
@@ -143,7 +143,7 @@ class Page:
         self.page.goto(url)
 
     def until(self, condition: str) -> None:
-        """Wait until a condition on what the page was told last holds."""
+        """Wait until a condition on the page's last message holds."""
         self.page.wait_for_function(f"state !== null && ({condition})")
 
     def press(self, x: float, y: float) -> None:

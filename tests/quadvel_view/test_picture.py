@@ -191,7 +191,7 @@ def test_the_way_behind_ends_where_odometry_starts_again() -> None:
     assert len(picture.trail) > 10
     picture.update("/odom", odometry(0.0, 0.0), 0.1)
     assert len(picture.trail) == 1
-    picture.update("/odom", odometry(5.0, 0.0), 0.2)  # nobody walked there
+    picture.update("/odom", odometry(5.0, 0.0), 0.2)  # the robot did not walk there
     assert len(picture.trail) == 1
 
 

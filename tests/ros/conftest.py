@@ -1,7 +1,7 @@
 """What these tests need of ROS 2: its environment, our workspace, and processes that end with the test.
 
 ROS 2 is taken from the environment where it is sourced, or from the setup file that QUADVEL_ROS_SETUP names;
-where neither is there the tests skip. colcon is looked for beside the interpreter that runs
+where neither is there the tests skip. colcon is looked for next to the interpreter that runs
 them, then on PATH.
 """
 

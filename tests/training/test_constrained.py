@@ -43,7 +43,7 @@ def test_the_pull_fades_and_the_constraints_grow(files):
     run.samples = 20_000
     last = run.step(0.9)
     assert first["pull"] > later["pull"] > last["pull"] == 0.0
-    assert run.teacher is None  # nobody asks it any more
+    assert run.teacher is None  # it is not asked any more
     assert 0.0 <= first["constraints"] < later["constraints"] < last["constraints"] == 1.0
     assert all(np.isfinite(value) for seen in (first, later, last) for value in seen.values())
 

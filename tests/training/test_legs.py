@@ -19,7 +19,7 @@ ROOM = FloorPlan([[2.0, -1.5, 0.02]], [[-1.0, 4.0, 6.0, 4.0], [5.5, -4.0, 5.5, 4
 
 
 def recorded(path: Path, person: bool, labels: bool) -> Path:
-    """A file of scans of a fixed scanner: a person who walks, or nobody."""
+    """A file of scans of a fixed scanner: a person who walks, or no person."""
     rng = np.random.default_rng(3)
     walker = Walker(way=[[2.5, -1.0], [2.5, 3.0]], speed=1.0)
     ranges, legs = [], []
@@ -47,11 +47,11 @@ def test_a_walking_person_is_found_without_labels_if_the_scanner_is_fixed(tmp_pa
         recorded(tmp_path / "legs_walk.npz", True, False), np.random.default_rng(0)
     )
     assert walking.legs.sum() > 40
-    nobody = leg_examples.read_examples_file(
+    empty = leg_examples.read_examples_file(
         recorded(tmp_path / "legs_none.npz", False, False), np.random.default_rng(0)
     )
-    assert not nobody.legs.any()
-    assert len(nobody.legs) > 100
+    assert not empty.legs.any()
+    assert len(empty.legs) > 100
 
 
 def test_a_short_training_makes_a_file_that_the_detector_takes(tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def calibrate_command(
         found = fit_calibration(chosen, _samples(suspended), _samples(standing))
     except (CalibrationDataError, CalibrationError) as error:
         raise ValueError(
-            f"{', '.join(map(str, recordings))}: {error}; expected a hung robot that creeps (--suspended), and one "
+            f"{', '.join(map(str, recordings))}: {error}; expected a suspended robot that creeps (--suspended), and one "
             "that stands still (--standing)"
         ) from None
     console = Console(markup=False, soft_wrap=True)

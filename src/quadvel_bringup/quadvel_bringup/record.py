@@ -218,7 +218,7 @@ def _absolute(topics: Sequence[str]) -> list[str]:
 
 
 def _spelling(topics: Sequence[str], present: Sequence[str]) -> str:
-    """Suggest present topics for those that nobody has; "" if there are none with a similar name."""
+    """Suggest present topics for those that do not exist; "" if there are none with a similar name."""
     unknown = [topic for topic in topics if topic not in present]
     near = [name for topic in unknown for name in get_close_matches(topic, present, 1)]
     return f"did you mean {', '.join(near)}?" if near else ""

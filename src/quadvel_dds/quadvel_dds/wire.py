@@ -454,7 +454,7 @@ class CallEndpoint:
     """
 
     def __init__(self, place: Participant, typename: str, name: str, profile: Any, serves: bool) -> None:
-        # Tells which writer and reader belong together, as in rmw_cyclonedds.
+        # Identifies the writer and the reader that belong together, as in rmw_cyclonedds.
         """Create writer and reader.
 
         Args:

@@ -40,7 +40,7 @@ class Selection:
             pose: Pose of the robot, (3,): x, y in m, yaw in rad.
 
         Returns:
-            Nearest confirmed person, else the nearest candidate; None if nobody is ahead.
+            Nearest confirmed person, else the nearest candidate; None if no person is ahead.
         """
         off = [track.position - np.asarray(pose[:2]) for track in tracks]
         bearing = [abs((np.arctan2(o[1], o[0]) - pose[2] + np.pi) % (2.0 * np.pi) - np.pi) for o in off]
@@ -68,11 +68,11 @@ class Selection:
         if identity == 0:
             found = self.nearest(tracks, pose)
             if found is None:
-                raise ValueError("nobody is ahead; expected a person within 60 degrees of its heading")
+                raise ValueError("no person is ahead; expected a person within 60 degrees of its heading")
         else:
             found = next((track for track in tracks if track.id == identity), None)
             if found is None:
-                known = ", ".join(str(track.id) for track in tracks) or "nobody"
+                known = ", ".join(str(track.id) for track in tracks) or "none"
                 raise ValueError(f"id is {identity}, expected one that is tracked: {known}")
         self._selects_nearest, self._id, self._last_seen = False, found.id, None
         return found

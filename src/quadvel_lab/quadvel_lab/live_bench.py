@@ -1,7 +1,7 @@
 """Measures the running stack against a floor (`quadvel bench --live`).
 
 The stack runs as `quadvel up --headless` starts it, and walks straight ahead. `live_floor` runs
-beside it and shows what the middleware, the network and the machine cost without the stack's own
+next to it and shows what the middleware, the network and the machine cost without the stack's own
 work. All figures of one run belong together; only their ratios carry over to other machines.
 
 An answer time is the time from the publication of a state to the publication of the message that

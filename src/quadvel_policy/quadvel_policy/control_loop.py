@@ -131,7 +131,7 @@ class ControlLoop:
             clock: Clock of the stamps, s.
             sim_time: Whether that clock is a simulator's in lockstep, which waits for the answer to
                 each state.
-            steady: Clock that nobody sets, s, by which steps of `clock` are detected; None if
+            steady: Clock that is never set, s, by which steps of `clock` are detected; None if
                 `clock` has none.
         """
         self.supervisor = supervisor

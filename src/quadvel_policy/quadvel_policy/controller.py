@@ -279,7 +279,7 @@ class Controller(Node):
         if self._loop.inputs.state is None:
             return DiagnosticStatus.WARN, f"{self._missing_state_text()} yet"
         writers = self.count_publishers(self._low_cmd.topic_name)
-        if writers > 1:  # no fault: one that only exists disturbs nobody
+        if writers > 1:  # no fault: a silent one does no harm
             return DiagnosticStatus.WARN, f"low_cmd has {writers} publishers, expected 1; {status}"
         if self._supervisor.findings:
             return DiagnosticStatus.WARN, f"{self._supervisor.findings[0].sentence}; {status}"

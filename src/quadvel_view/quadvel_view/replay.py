@@ -41,7 +41,7 @@ def replay(
     # The web server's thread fills the queue; this thread executes the orders between two frames.
     orders = OrderQueue()
     viewer = Viewer(playback.picture.robot, host, port, orders.put, lambda page: None)
-    idle = Operator()  # the page needs one; nobody drives a recorded robot
+    idle = Operator()  # the page needs one; a recorded robot is not driven
     try:
         announce(viewer.url)
         then = time.monotonic()

@@ -19,7 +19,7 @@ SCHEMA = 1
 MEASURED_COLOUR, EXPECTED_COLOUR, SPAN_COLOUR = "black", "tab:orange", "tab:red"
 NO_WALK = (
     "no walk is reported in this recording, and the limits are those of healthy walks: friction of the joints, or "
-    "another motion, may look like this; `quadvel identify` tells them apart"
+    "another motion, may look like this; `quadvel identify` distinguishes them"
 )
 
 

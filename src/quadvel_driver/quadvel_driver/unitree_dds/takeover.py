@@ -3,7 +3,7 @@
 What is sent, in this order:
 
 - nothing, until the battery is charged, the motion switcher has released the robot's own controller,
-  and nobody has written `rt/lowcmd` or been connected to it for QUIET_S;
+  and no program has written `rt/lowcmd` or been connected to it for QUIET_S;
 - commands, or damping without them; the switcher is asked again every ASK_PERIOD_S;
 - damping for BRAKE_S, if another program writes `rt/lowcmd` or is connected to it, or if the robot's
   own controller is back;
