@@ -58,6 +58,24 @@ def test_a_trimmed_command_stays_within_the_limits_of_the_policy() -> None:
     assert robot.got[0] == 1.9
 
 
+@pytest.mark.parametrize(
+    "command", [(2.5, 0.0, 0.225), (-2.1, 0.0, 0.291), (0.39, 0.22, -4.05), (1.8, 0.6, 0.5)]
+)
+@pytest.mark.parametrize("error", [(-0.03, 0.0, 0.0), (-0.15, 0.15, -0.15), (0.15, -0.15, 0.15)])
+def test_more_speed_takes_no_more_turn_rate_than_the_bound(
+    command: tuple[float, float, float], error: tuple[float, float, float]
+) -> None:
+    """The limits of the policy couple the axes: a trim of vx must not remove a commanded turn."""
+    limits = VelocityCommandLimits((-2.2, -1.5, -5.0), (2.6, 1.5, 5.0), 5.0)
+    wanted = limits.clamp(command)
+    trim = VelocityTrim(limits, 0.1)
+    for _ in range(round(20.0 / TICK_S)):
+        velocity = np.array(wanted) + error
+        got = trim.apply(np.array([*wanted, 0.0]), velocity, velocity[2])
+        assert np.abs(got[:3] - wanted).max() <= 0.1 + 1e-6
+        np.testing.assert_allclose(limits.clamp(got[:3].tolist()), got[:3], atol=1e-9)
+
+
 def test_the_trim_fades_while_the_command_changes_and_ends_in_stance() -> None:
     robot = SlowRobot((-0.06, 0.0, 0.0))
     robot.walk((1.0, 0.0, 0.0, 0.0), 10.0)

@@ -24,6 +24,11 @@ INTEGRATION_S = 1.0
 loop through the robot does not oscillate.
 """
 
+_BISECTIONS = 8
+"""Halvings to find how much of a trim the limits leave: a 256th of it."""
+_ROUND_OFF = 1e-9
+"""m/s and rad/s by which sums of a command and its trim may miss the bound."""
+
 Axes = tuple[float, float, float]
 ZERO: Axes = (0.0, 0.0, 0.0)
 
@@ -38,7 +43,8 @@ class VelocityTrim:
         i' = -i / INTEGRATION_S       elsewhere: the command changes
         i  = 0                        in stance, or for a zero velocity: the robot brakes
 
-    with |i| <= bound and c + i within the limits of the policy, which gets c + i.
+    with |i| <= bound and c + i within the limits of the policy, which gets c + i. The limits couple the
+    axes: more speed leaves less turn rate. So i is shortened until no axis loses more than its bound.
 
     Attributes:
         trim: The present trim i of vx, vy (m/s) and wz (rad/s).
@@ -85,9 +91,32 @@ class VelocityTrim:
             ix, iy, iz = (min(max(i, -self._bound), self._bound) for i in trim)
         else:
             ix, iy, iz = (i * self._decay for i in self.trim)
-        px, py, pz = self._limits.clamp((vx + ix, vy + iy, wz + iz))
+        px, py, pz = self._add(wanted, (ix, iy, iz))
         self.trim = px - vx, py - vy, pz - wz
         return np.array([px, py, pz, stance])
+
+    def _add(self, wanted: Axes, trim: Axes) -> Axes:
+        """Add the longest part of a trim that changes no axis by more than the bound, within the limits."""
+        found = self._add_share(wanted, trim, 1.0)
+        if self._is_near(found, wanted):
+            return found
+        low, high, found = 0.0, 1.0, wanted
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            tried = self._add_share(wanted, trim, middle)
+            if self._is_near(tried, wanted):
+                low, found = middle, tried
+            else:
+                high = middle
+        return found
+
+    def _add_share(self, wanted: Axes, trim: Axes, share: float) -> Axes:
+        """Add a share of a trim to a command and clamp the sum to the limits of the policy."""
+        return self._limits.clamp(c + share * i for c, i in zip(wanted, trim, strict=True))
+
+    def _is_near(self, found: Axes, wanted: Axes) -> bool:
+        """Whether each axis lies within the bound of the command."""
+        return max(abs(p - c) for p, c in zip(found, wanted, strict=True)) <= self._bound + _ROUND_OFF
 
     def _follow(self, wanted: Axes) -> float:
         """Update the low-pass of the command; return the command's largest distance from it, m/s or rad/s."""
