@@ -203,7 +203,7 @@ def _slope_limits(rows: Rows) -> Iterable[str]:
     yield f"All robots walk and follow on {walked} of {len(shares)} combinations of slope, plant and start."
     for where, value in shares.items():
         if value < 100.0:
-            yield f"Slopes, {where}: {100.0 - value:.0f} % of the robots fall or are stuck."
+            yield f"Slopes, {where}: {100.0 - value:.0f} % of the robots fall, are stuck, or are off by more than 0.15 m/s."
 
 
 def _policy_limits(metadata: Json, found: Sequence[Json]) -> Iterable[str]:
