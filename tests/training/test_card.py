@@ -112,7 +112,7 @@ def test_a_policys_known_limits_follow_from_the_papers_sections(evaluation, tmp_
               for plant, share in (("usual plant", "0.90"), ("second plant,", "1.04"), ("loose joints", "1.21"))]  # fmt: skip
     assert shares == [1, 1, 1]
     assert [line for line in limits if "stuck" in line] == [
-        "- Slopes, started at once, 15 degrees down: 33 % of the robots fall or are stuck."
+        "- Slopes, started at once, 15 degrees down: 33 % of the robots fall, are stuck, or are off by more than 0.15 m/s."
     ]
 
 
