@@ -227,6 +227,9 @@ class Drive:
 class Robot:
     """All numbers of a robot. Joint order as in `quadruped.JOINT_NAMES`; all arrays are read-only.
 
+    The largest values accepted are far above those of any such robot: they refuse other units, such as
+    millimetres, degrees or turns per minute, and kg cm^2.
+
     Attributes:
         name: Name of the robot in files.
         title: Name of the robot in texts.
