@@ -458,7 +458,7 @@ def test_a_network_that_does_not_fit_its_file_is_refused(
 
 def test_torchscript_is_refused_unopened(tmp_path: Path) -> None:
     (tmp_path / "policy.pt").touch()
-    with pytest.raises(NetworkFileError, match=r"policy\.pt: is TorchScript, .* expected ONNX"):
+    with pytest.raises(NetworkFileError, match=r"policy\.pt: is a pickle, .* expected ONNX"):
         import_policy(GO2, tmp_path / "policy.pt", None, tmp_path / "out.onnx")
 
 

@@ -156,7 +156,7 @@ def _find_tensor_problems(tensor: Message) -> Iterator[str]:
     """Yield a sentence for every property of a tensor that is not allowed."""
     name, kind, dims = tensor.one("name", ""), tensor.one("data_type", 0), tensor.all("dims")
     if tensor.one("data_location", 0):
-        yield f"tensor {name!r} lies in another file, expected all data in this one"
+        yield f"tensor {name!r} lies in another file, expected all data in this one (torch.onnx.export: external_data=False)"
     if kind not in ALLOWED_TENSOR_TYPES:
         expected = ", ".join(sorted(ALLOWED_TENSOR_TYPES.values()))
         yield f"tensor {name!r} is of type {kind}, expected {expected}"

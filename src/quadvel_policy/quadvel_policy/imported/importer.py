@@ -65,8 +65,9 @@ def import_policy(
     reader = mjlab if config is None else _format_of(config, fields)
     if weights.suffix in PICKLED and weights.exists():
         raise NetworkFileError(
-            f"{weights}: is TorchScript, which can run code when it is opened, expected ONNX: convert it "
-            "where you trust it, with torch.onnx.export(torch.jit.load(file), torch.zeros(1, n), 'policy.onnx')"
+            f"{weights}: is a pickle, which can run code when it is opened, expected ONNX; where you trust it, "
+            "export its network: torch.onnx.export(network, (torch.zeros(1, n),), 'policy.onnx', dynamo=False), with "
+            "network = torch.jit.load(file) for TorchScript; a checkpoint has no network, only its weights"
         )
     model = read_network(weights)
     output, supplement = _action_output(weights, model), supplement or Supplement()
