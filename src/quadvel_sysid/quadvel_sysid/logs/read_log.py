@@ -69,8 +69,8 @@ def read_log(
         raise LogError(str(error)) from None
     if on_bench and robot is None:
         remarks.append(
-            f"robot: none, as the joints are not a quadruped's; the model has the torque limits of {found.title}, "
-            "--base FILE states others"
+            f"robot: none, as the joints are not a quadruped's; the model has the torque limits of {found.title}: "
+            "write yours into `torque_limit` of actuator.yaml"
         )
     log = attrs.evolve(log, robot=found, remarks=tuple(remarks), warnings=(*log.warnings, *warnings))
     return log if joints is None else log.select_joints(joints)
