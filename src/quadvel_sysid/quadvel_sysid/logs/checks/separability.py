@@ -32,7 +32,7 @@ CONFUSED_PAIRS = {
     (
         "input delay",
         "output delay",
-    ): "the joint's own motion (kp dq + kd ddq), which only the output delay shifts",
+    ): "faster motion of the joint itself, which only the output delay shifts",
     ("kd", "Coulomb friction"): "changes of speed: move slower and faster",
     ("kp", "torque offset"): "changes of the position error: load the joint both ways",
     ("kd", "output delay"): "fast changes of the torque: steps or higher frequencies",
@@ -60,8 +60,8 @@ def collinear(log: Log) -> Iterator[Finding]:
         share = float(np.median(shares))
         if share < MIN_SEPARATION:
             text = (
-                f"q_des: {first} and {second} are separable only through {motion}; "
-                f"here that is {100 * share:.0f} % of what they do to the torque"
+                f"q_des: this motion hardly separates {first} from {second}: only {100 * share:.0f} % of what they "
+                f"do to the torque differs; what separates them is {motion}"
             )
             yield Finding("note" if share > 0.5 * MIN_SEPARATION else "warning", "q_des", (), text)
 
