@@ -17,7 +17,24 @@ from rclpy.node import Node  # noqa: E402
 from sensor_msgs.msg import Joy  # noqa: E402
 
 PAGE = Path(__file__).parents[2] / "docs" / "robot.md"
-BUTTONS = ("R1", "L1", "start", "select", "R2", "L2", "F1", "F2", "A", "B", "X", "Y", "up", "right", "down", "left")
+BUTTONS = (
+    "R1",
+    "L1",
+    "start",
+    "select",
+    "R2",
+    "L2",
+    "F1",
+    "F2",
+    "A",
+    "B",
+    "X",
+    "Y",
+    "up",
+    "right",
+    "down",
+    "left",
+)
 
 
 def test_the_remote_of_the_page_holds_its_buttons_and_lets_them_go(tmp_path: Path) -> None:
