@@ -10,7 +10,24 @@ quadvel_dds.install()  # without ROS 2: the embedded middleware
 import rclpy  # noqa: E402
 from sensor_msgs.msg import Joy  # noqa: E402
 
-BUTTONS = ["R1", "L1", "start", "select", "R2", "L2", "F1", "F2", "A", "B", "X", "Y", "up", "right", "down", "left"]
+BUTTONS = [
+    "R1",
+    "L1",
+    "start",
+    "select",
+    "R2",
+    "L2",
+    "F1",
+    "F2",
+    "A",
+    "B",
+    "X",
+    "Y",
+    "up",
+    "right",
+    "down",
+    "left",
+]
 
 rclpy.init()
 node = rclpy.create_node("remote")
