@@ -419,3 +419,9 @@ def test_a_file_that_is_none_is_refused(tmp_path: Path) -> None:
 def test_an_obstacle_where_the_robot_starts_is_refused_by_name(parts: dict[str, Any], name: str) -> None:
     with pytest.raises(ValueError, match=f"{name}.* where the robot starts"):
         Simulator(SimulatorConfig(robot=ALIENGO, world=World(**parts)))
+
+
+def test_an_empty_file_is_said_to_hold_nothing(tmp_path: Path) -> None:
+    (tmp_path / "empty.yaml").write_text("")
+    with pytest.raises(ValueError, match=r"empty\.yaml: found nothing, expected fields with their values"):
+        World.load(tmp_path / "empty.yaml")

@@ -257,7 +257,7 @@ def test_a_wrong_line_of_a_table_is_refused(tmp_path: Path, line: str, sentence:
 def test_columns_of_different_joints_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text("t,q/a,dq/b,q_des/a\n" + "".join(f"{k},1,2,3\n" for k in range(20)))
-    with pytest.raises(LogError, match=r"a\.csv: dq/a: the columns of dq and of q name different joints"):
+    with pytest.raises(LogError, match=r"a\.csv: dq: found columns of b, expected those of q: a"):
         read_log(path)
 
 

@@ -47,7 +47,7 @@ def test_clean_log_is_not_corrected(tmp_path: Path, seed: int) -> None:
     log = recorded(seed)
     found = inspect_file(tmp_path, log)
     assert texts(found, "refusal") == []
-    assert not [text for text in texts(found, "warning") if "separable" not in text]
+    assert not [text for text in texts(found, "warning") if "hardly separates" not in text]
     for name in ("t", "q", "dq", "tau", "q_des"):
         np.testing.assert_array_equal(getattr(found.log, name), log[name])
 
@@ -201,6 +201,11 @@ def test_gains_in_a_unit_of_their_own_are_fitted_and_those_of_one_joint_are_refu
     log = recorded(3)
     assert "kp in N m/degree" in refusal(inspect_file(tmp_path, log | {"kp": KP * np.pi / 180.0}))
     assert "on thigh_joint" in refusal(inspect_file(tmp_path, log | {"kp": KP * np.array([1.0, 40.0, 1.0])}))
+
+
+def test_exchanged_gains_are_refused_by_their_cause(tmp_path: Path) -> None:
+    text = refusal(inspect_file(tmp_path, recorded(3) | {"kp": 0.5, "kd": KP}))
+    assert f"kp 0.5 and kd {KP:.3g} exchanged" in text
 
 
 # Files

@@ -91,7 +91,8 @@ def _place_first(text: str) -> str:
 def _mapping(value: object, prefix: str = "") -> Mapping[str, Any]:
     """Return a value that is a mapping, else raise ValueError."""
     if not isinstance(value, Mapping):
-        raise ValueError(f"{prefix}found {value!r}, expected fields with their values")
+        found = "nothing" if value is None else repr(value)
+        raise ValueError(f"{prefix}found {found}, expected fields with their values")
     return value
 
 

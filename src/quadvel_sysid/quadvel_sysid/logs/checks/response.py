@@ -380,7 +380,8 @@ def gain_units(log: Log, found: Response) -> Iterator[Finding | Log]:
     if not off.any():
         return
     number, joints = float(np.median(ratio[off])), log.joints_where(off)
-    known = [unit for unit, factor in _UNITS_OF_TORQUE if abs(np.log(number / factor)) < np.log(1.5)]
+    causes = [*_exchanged_gains(log), *_UNITS_OF_TORQUE]
+    known = [unit for unit, factor in causes if abs(np.log(number / factor)) < np.log(1.5)]
     if known or (off != clear).any():
         expected = f"{known[0]}? " if known else ""
         size = f"{number:.3g}" if number < 100.0 else f"{number:.2g}"
@@ -393,6 +394,14 @@ def gain_units(log: Log, found: Response) -> Iterator[Finding | Log]:
     )
     yield Finding("warning", "kp", joints, text)
     yield attrs.evolve(log, kp=None, kd=None)
+
+
+def _exchanged_gains(log: Log) -> Iterator[tuple[str, float]]:
+    """Ratio of the torque to what kp asks for if kp and kd are exchanged, with that mistake."""
+    if log.kp is not None and log.kd is not None:
+        kp, kd = float(np.median(log.kp)), float(np.median(log.kd))
+        if kd > kp > 0.0:
+            yield f"kp {kp:.3g} and kd {kd:.3g} exchanged", kd / kp
 
 
 def _is_bounded(log: Log, found: Response, j: int) -> bool:

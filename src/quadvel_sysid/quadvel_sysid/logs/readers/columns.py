@@ -280,8 +280,9 @@ def _in_order(
     if joints and sorted(own) == sorted(joints):
         return joints, joints
     if joints and field != "q":
-        odd = sorted(set(own) ^ set(joints))
-        raise LogError(f"{path}: {field}/{odd[0]}: the columns of {field} and of q name different joints")
+        raise LogError(
+            f"{path}: {field}: found columns of {format_names(own)}, expected those of q: {format_names(joints)}"
+        )
     return (own if field == "q" or joints is None else joints), own
 
 
