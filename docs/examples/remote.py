@@ -10,29 +10,13 @@ quadvel_dds.install()  # without ROS 2: the embedded middleware
 import rclpy  # noqa: E402
 from sensor_msgs.msg import Joy  # noqa: E402
 
-BUTTONS = [
-    "R1",
-    "L1",
-    "start",
-    "select",
-    "R2",
-    "L2",
-    "F1",
-    "F2",
-    "A",
-    "B",
-    "X",
-    "Y",
-    "up",
-    "right",
-    "down",
-    "left",
-]
+from quadvel_driver.board_state import Button  # noqa: E402
 
 rclpy.init()
 node = rclpy.create_node("remote")
 remote = node.create_publisher(Joy, "board/remote", 10)
-held = Joy(axes=[0.0] * 4, buttons=[int(name in sys.argv[1:]) for name in BUTTONS])
+names = [name.upper() for name in sys.argv[1:]]
+held = Joy(axes=[0.0] * 4, buttons=[int(button.name in names) for button in Button])
 end = time.monotonic() + 1.0
 while time.monotonic() < end or not remote.get_subscription_count():
     remote.publish(held)
