@@ -117,6 +117,34 @@ def test_a_node_that_ends_by_itself_is_a_fault_even_with_exit_code_0(monkeypatch
     assert up.up(Stack()) == 1
 
 
+def test_of_two_that_start_at_the_same_instant_one_runs(tmp_path: Path) -> None:
+    def start(name: str) -> subprocess.Popen[bytes]:
+        line = [sys.executable, "-m", "quadvel_bringup", "up", "--policy", "none"]
+        return subprocess.Popen(line, stdout=(tmp_path / name).open("wb"), stderr=subprocess.STDOUT)
+
+    both = [start("first"), start("second")]
+    try:
+        until = time.monotonic() + 60.0
+        while time.monotonic() < until and all(one.poll() is None for one in both):
+            time.sleep(0.1)
+        (refused,) = (index for index, one in enumerate(both) if one.poll() is not None)
+        assert both[refused].returncode == 2
+        survivor = both.pop(1 - refused)
+        sentence = (tmp_path / ("first", "second")[refused]).read_text()
+        assert f"pid {survivor.pid}" in sentence
+        assert "Traceback" not in sentence
+        both = [survivor]
+        output = tmp_path / ("first", "second")[1 - refused]
+        while time.monotonic() < until and "stood up" not in output.read_text():
+            time.sleep(0.1)
+        assert "stood up" in output.read_text()
+        assert "publishers" not in output.read_text()
+    finally:
+        for one in both:
+            one.send_signal(signal.SIGINT)
+        assert [one.wait(30.0) for one in both] == [0] * len(both)
+
+
 def test_beside_another_simulator_it_does_not_start(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -135,8 +163,7 @@ def test_beside_another_simulator_it_does_not_start(
     try:
         until = time.monotonic() + 30.0
         while time.monotonic() < until:
-            with suppress(RobotAlreadyRunningError):
-                up.check_exclusive()
+            with suppress(RobotAlreadyRunningError), up.only_robot():
                 continue
             break
         named = f"low_state: already published on ROS domain .* by sim_node \\(pid {other.pid}\\)"

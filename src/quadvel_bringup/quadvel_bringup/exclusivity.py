@@ -6,7 +6,10 @@ Two of them would send conflicting states and commands.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import socket
+import struct
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
 from itertools import dropwhile
 from pathlib import Path
 from typing import Any
@@ -28,17 +31,34 @@ class RobotAlreadyRunningError(ConnectionError):
     """Another robot or simulator is on this ROS domain."""
 
 
-def ensure_exclusive(node: Any) -> None:
-    """Check that no other node publishes low_state.
+@contextmanager
+def domain_claimed(node: Any) -> Iterator[None]:
+    """Claim this host's ROS domain for one robot, for as long as the context lasts.
+
+    Without it, two programs that start at the same instant would both find no publisher. The claim is
+    a Unix socket with an abstract name: no file, shared by all users and by containers that share the
+    network, and freed by the kernel when the process ends, however it ends.
 
     Args:
-        node: A node that does not publish low_state itself.
+        node: A node that does not publish low_state itself; used at the start only.
+
+    Yields:
+        Nothing.
 
     Raises:
-        RobotAlreadyRunningError: There is a publisher; the sentence names its process.
+        RobotAlreadyRunningError: Another program has claimed it, or low_state has a publisher; the
+            sentence names its process.
     """
-    if has_publisher(node, TOPIC, LOADED_DISCOVERY_TIME_S if robots_on_domain() else DISCOVERY_TIME_S):
-        raise _already_published(describe_robots())
+    address = f"\0quadvel-robot-on-domain-{ros_domain()}"
+    with closing(socket.socket(socket.AF_UNIX)) as claim:
+        try:
+            claim.bind(address)
+        except OSError:  # EADDRINUSE
+            raise _already_published(_owner(address)) from None
+        claim.listen()
+        if has_publisher(node, TOPIC, LOADED_DISCOVERY_TIME_S if robots_on_domain() else DISCOVERY_TIME_S):
+            raise _already_published(describe_robots())
+        yield
 
 
 def describe_robots() -> str:
@@ -72,6 +92,20 @@ def _already_published(by: str) -> RobotAlreadyRunningError:
         f"{TOPIC}: already published on ROS domain {ros_domain()} by {by}. Stop it, or set "
         "ROS_DOMAIN_ID to another number"
     )
+
+
+def _owner(address: str) -> str:
+    """Name the program that listens at a Unix socket."""
+    with closing(socket.socket(socket.AF_UNIX)) as client:
+        client.setblocking(False)
+        try:
+            client.connect(address)
+        except OSError:  # it does not listen yet, or has just ended
+            return "another program"
+        credentials = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    pid, *_ = struct.unpack("3i", credentials)
+    words = _program(Path("/proc") / str(pid))
+    return f"{' '.join(words[:2]) or 'another program'} (pid {pid})"
 
 
 def _listed(robots: Mapping[int, str]) -> str:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
+
 from rich.console import Console
 
 import quadvel_dds
 
-from .exclusivity import ensure_exclusive
+from .exclusivity import domain_claimed
 from .node_output import PrefixedOutput
 from .page_watch import PageWatch
 from .preflight import check_stack
@@ -30,9 +33,12 @@ def up(stack: Stack, view: bool = False) -> int:
         The exit code.
     """
     check_stack(stack)
-    if stack.brings_robot:
-        check_exclusive()
-    nodes = stack.commands(view)
+    with only_robot() if stack.brings_robot else nullcontext():
+        return _run(stack.commands(view))
+
+
+def _run(nodes: Mapping[str, Sequence[str]]) -> int:
+    """Run processes until Ctrl-C or until one of the nodes ends, and return the exit code of `up`."""
     say = PrefixedOutput(["quadvel", *nodes], Console(markup=False, soft_wrap=True))
     with StopSignals() as signals, ProcessGroup(say) as group:
         say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them, `quadvel status` shows their health")
@@ -53,13 +59,23 @@ def up(stack: Stack, view: bool = False) -> int:
     return 1 if any(codes.values()) else 0
 
 
-def check_exclusive() -> None:
-    """Raise RobotAlreadyRunningError if another robot or simulator publishes in this ROS domain."""
+@contextmanager
+def only_robot() -> Iterator[None]:
+    """Claim this ROS domain for a robot.
+
+    Yields:
+        Nothing.
+
+    Raises:
+        RobotAlreadyRunningError: Another program has claimed it, or a robot or simulator publishes in it.
+    """
     quadvel_dds.install()
     from .session import Session
 
-    with Session("look_for_others") as session:
-        ensure_exclusive(session.node)
+    with ExitStack() as claim:
+        with Session("look_for_others") as session:
+            claim.enter_context(domain_claimed(session.node))
+        yield
 
 
 def _positive(code: int) -> int:

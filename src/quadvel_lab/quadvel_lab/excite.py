@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,7 +20,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import quadvel_dds
-from quadvel_bringup.exclusivity import ensure_exclusive
+from quadvel_bringup.exclusivity import domain_claimed
 from quadvel_bringup.node_output import PrefixedOutput
 from quadvel_bringup.nodes import Parameters, enclave, process_command, ros_arguments
 from quadvel_bringup.preflight import check_node
@@ -331,9 +332,8 @@ def record_motion(
     clock = [Parameter("use_sim_time", value=bool(nodes))]
     node, recorder = (rclpy.create_node(name, parameter_overrides=clock) for name in ("excite", "recorder"))
     try:
-        if nodes:
-            ensure_exclusive(node)
         with (
+            domain_claimed(node) if nodes else nullcontext(),
             StopSignals() as signals,
             bar,
             atomic_write(path) as draft,

@@ -33,7 +33,7 @@ quadvel_dds.install()  # before anything imports rclpy
 # ruff: noqa: E402
 from geometry_msgs.msg import Twist, TwistWithCovarianceStamped
 
-from quadvel_bringup.exclusivity import ensure_exclusive
+from quadvel_bringup.exclusivity import domain_claimed
 from quadvel_bringup.nodes import ros_arguments
 from quadvel_bringup.processes import ProcessGroup, StopSignals
 from quadvel_bringup.session import Session, not_running
@@ -143,7 +143,7 @@ class LiveRun:
         with ExitStack() as stack:
             self._signals = stack.enter_context(StopSignals())
             self._session = stack.enter_context(Session("live_bench"))
-            ensure_exclusive(self._session.node)
+            stack.enter_context(domain_claimed(self._session.node))
             group = ProcessGroup(lambda name, line: self._output.append(f"{name}: {line}"))
             self._group = stack.enter_context(group)
             for name, line in {**Stack().commands(), "floor": [*FLOOR, *ros_arguments("floor", {})]}.items():

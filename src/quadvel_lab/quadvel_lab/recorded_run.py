@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import quadvel_dds
-from quadvel_bringup.exclusivity import ensure_exclusive
+from quadvel_bringup.exclusivity import domain_claimed
 from quadvel_bringup.node_output import PrefixedOutput
 from quadvel_bringup.nodes import enclave
 from quadvel_bringup.page_watch import PageWatch
@@ -123,8 +123,8 @@ class RecordedRun(ABC):
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         try:
-            ensure_exclusive(node)
             with (
+                domain_claimed(node),
                 StopSignals() as signals,
                 Recorder(node, RecordingFile(self._recording)) as recorder,
                 self._bar,

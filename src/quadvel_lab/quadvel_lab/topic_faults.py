@@ -33,7 +33,7 @@ from quadvel_bringup.error_sentence import exit_with_sentence
 from quadvel_bringup.processes import ProcessGroup
 from quadvel_bringup.session import Session
 from quadvel_bringup.stack import Stack
-from quadvel_bringup.up import check_exclusive
+from quadvel_bringup.up import only_robot
 from quadvel_description.robot import Robot, load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand
@@ -595,18 +595,9 @@ def _known(names: list[str]) -> list[str]:
     return names
 
 
-def main(
-    names: Annotated[
-        list[str], typer.Argument(callback=_known, help="Rows of docs/faults.md (default: all).")
-    ] = [],  # noqa: B006 typer copies it
-) -> None:
-    """Start a simulated robot, inject faults on its topics, and print how each is reported.
-
-    No other robot may run on this ROS domain. Exit code 1 if a fault was not reported.
-    """
-    with exit_with_sentence("topic_faults"):
-        check_exclusive()
-    wanted, missed = set(names), 0
+def _provoke_all(wanted: set[str]) -> int:
+    """Inject the named faults, or all; return how many were not reported."""
+    missed = 0
     for low_level, faults in (("sim", FAULTS), ("board", BOARD_FAULTS)):
         chosen = [fault for fault in faults if not wanted or fault.name in wanted]
         if not chosen:
@@ -619,6 +610,20 @@ def main(
                 except AssertionError as error:
                     text, missed = f"MISSED: {error}", missed + 1
                 print(f"{fault.name}: {text}", flush=True)
+    return missed
+
+
+def main(
+    names: Annotated[
+        list[str], typer.Argument(callback=_known, help="Rows of docs/faults.md (default: all).")
+    ] = [],  # noqa: B006 typer copies it
+) -> None:
+    """Start a simulated robot, inject faults on its topics, and print how each is reported.
+
+    No other robot may run on this ROS domain. Exit code 1 if a fault was not reported.
+    """
+    with exit_with_sentence("topic_faults"), only_robot():
+        missed = _provoke_all(set(names))
     sys.exit(1 if missed else 0)
 
 
