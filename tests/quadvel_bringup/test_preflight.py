@@ -80,7 +80,7 @@ def test_a_robot_without_a_board_that_is_known_here_has_no_driver(tmp_path: Path
         ),
         (
             {"estimator": "magic"},
-            "estimator: EstimatorParameters.kind: found 'magic', expected one of learned, kalman",
+            "estimator: kind: found 'magic', expected one of learned, kalman",
         ),
         ({"policy": Path("nowhere.onnx")}, r"controller: .*nowhere\.onnx: no such file"),
         ({"policy": PARAMETERS}, r"controller: .*params\.yaml"),

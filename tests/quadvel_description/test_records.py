@@ -60,6 +60,21 @@ def test_wrong_content_is_refused_with_its_place(content: object, expected: str)
     assert str(refused.value) == f"my.yaml: {expected}"
 
 
+def test_a_file_of_another_kind_is_refused_as_a_whole() -> None:
+    @attrs.frozen
+    class Model:
+        name: str
+        gain: float
+        delay: float
+
+    with pytest.raises(
+        ValueError, match=r"found the fields a, b, c, d and 1 more, expected name, gain, delay$"
+    ):
+        structure_record(Model, dict.fromkeys("abcde", 1))
+    with pytest.raises(ValueError, match="delay: found nothing, expected a value"):
+        structure_record(Model, {"name": "x", "gain": 1.0})
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [("- 1", r"found \[1\], expected fields"), ("schema: 2", "schema: found 2, expected 1")],

@@ -249,6 +249,11 @@ def test_a_port_that_is_taken_is_told_in_one_sentence(board: TestBoard) -> None:
         UdpTransport(config)
 
 
+def test_an_empty_address_is_refused() -> None:
+    with pytest.raises(ValueError, match="board_address: found '', expected"):
+        UdpConfig(board_address="")
+
+
 def test_an_address_that_is_none_is_told_in_one_sentence() -> None:
     with pytest.raises(LinkError, match=r"no link from any address:0 to 300\.1\.1\.1:8007: "):
         UdpTransport(UdpConfig(board_address="300.1.1.1", local_port=0))

@@ -190,9 +190,9 @@ def test_what_is_not_fit_to_use_is_refused_counted_and_named(bench: Bench) -> No
     [
         (
             "kind:=psychic",
-            "parameters: EstimatorParameters.kind: found 'psychic', expected one of learned, kalman",
+            "parameters: kind: found 'psychic', expected one of learned, kalman",
         ),
-        ("reset_gap:=0.0", "parameters: EstimatorParameters.reset_gap: found 0.0, expected above 0"),
+        ("reset_gap:=0.0", "parameters: reset_gap: found 0.0, expected above 0"),
         ("reset_gap:=soon", "parameter reset_gap: "),
         ("speed:=3", "unknown parameter speed, expected one of realtime_priority, cpus, robot, kind, model"),
     ],

@@ -68,7 +68,7 @@ def test_each_reaches_the_record_that_it_belongs_to(tmp_path: Path) -> None:
         ({"state_rate": 300}, "state_rate is 300 Hz, expected a divisor of 1000, 50 at least"),
         ({"state_rate": 0}, "state_rate is 0 Hz, expected a divisor of 1000, 50 at least"),
         ({"answer_timeout": 0.0}, "answer_timeout is 0.0 s, expected a time above 0"),
-        ({"terrain": "moon"}, "Terrain.kind: found 'moon', expected one of flat, slope, rough"),
+        ({"terrain": "moon"}, "SimParameters.terrain: found 'moon', expected one of flat, slope, rough"),
         ({"friction": (0.5, 0.4)}, "SimulatorConfig.friction: found shape"),
         (
             {"actuator_file": "nowhere.yaml"},

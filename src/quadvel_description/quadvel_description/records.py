@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, get_origin
@@ -64,11 +64,27 @@ def structure_record(kind: type[Record], content: object, path: Path | None = No
             and expectation.
     """
     prefix = "" if path is None else f"{path}: "
+    fields = _mapping(content, prefix)
+    _check_kind(kind, fields, prefix)
     try:
-        return _CONVERTER.structure(_mapping(content, prefix), kind)
+        return _CONVERTER.structure(fields, kind)
     except cattrs.BaseValidationError as error:
         texts = cattrs.transform_error(error, path="", format_exception=_explain)
     raise ValueError(prefix + "; ".join(_place_first(text) for text in texts)) from None
+
+
+def _check_kind(kind: type, fields: Mapping[str, Any], prefix: str) -> None:
+    """Refuse a mapping that lacks most of the required fields: probably a file of another kind."""
+    required = [field.name for field in attrs.fields(kind) if field.default is attrs.NOTHING]
+    missing = [name for name in required if name not in fields]
+    if fields and len(missing) > max(1, len(required) // 2):
+        raise ValueError(f"{prefix}found the fields {_some(fields)}, expected {_some(required)}")
+
+
+def _some(names: Collection[str]) -> str:
+    """List the first of some names."""
+    first, more = [*names][:4], len([*names]) - 4
+    return ", ".join(first) + (f" and {more} more" if more > 0 else "")
 
 
 def _explain(error: BaseException, kind: type | None) -> str:

@@ -12,7 +12,7 @@ from collections import Counter
 import attrs
 from typing_extensions import override
 
-from quadvel_description.fields import field
+from quadvel_description.fields import field, refusal
 
 from .link import LinkConfig, LinkError, Transport
 
@@ -41,6 +41,12 @@ class UdpConfig(LinkConfig):
         at_most=65535,
         whole=True,
     )
+
+    @board_address.validator
+    def _is_given(self, attribute: object, value: str) -> None:
+        """Require an address: the operating system takes an empty one for this computer."""
+        if not value:
+            raise refusal(self, "board_address", value, "the board's IP address")
 
 
 class UdpTransport(Transport):
@@ -103,6 +109,7 @@ def _connect(config: UdpConfig) -> socket.socket:
         own = f"{config.local_address or 'any address'}:{config.local_port}"
         on = f" on {config.interface}" if config.interface else ""
         raise LinkError(
-            f"no link from {own}{on} to {config.board_address}:{config.board_port}: {error}"
+            f"no link from {own}{on} to {config.board_address}:{config.board_port}: {error}; "
+            "expected the address of the robot's board (board_address) and a free port here (local_port)"
         ) from error
     return endpoint

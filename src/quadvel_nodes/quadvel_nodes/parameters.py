@@ -34,7 +34,10 @@ def make_record(record: type[Record], values: Mapping[str, Any]) -> Record:
         values: Values by name of the parameter; the default of a missing one is used.
 
     Returns:
-        The record. ValueError of its validators passes through.
+        The record.
+
+    Raises:
+        ValueError: A validator refuses a value; the message begins with the parameter.
     """
     given: dict[str, Any] = {}
     for field in attrs.fields(record):  # type: ignore[arg-type]
@@ -43,4 +46,7 @@ def make_record(record: type[Record], values: Mapping[str, Any]) -> Record:
             given[field.name] = make_record(part, values)
         elif field.name in values:
             given[field.name] = values[field.name]
-    return record(**given)
+    try:
+        return record(**given)
+    except ValueError as error:
+        raise ValueError(str(error).removeprefix(f"{record.__name__}.")) from error

@@ -45,7 +45,7 @@ class PlantParameters(Scheduling):
     world: str = field(
         "", f"world around the robot: a YAML file, or {', '.join(SHIPPED_WORLDS)}; empty: none"
     )
-    terrain: str = field(_TERRAIN.kind, f"the ground: {', '.join(KINDS)}")
+    terrain: str = field(_TERRAIN.kind, f"the ground: {', '.join(KINDS)}", one_of=KINDS)
     slope: float = field(
         _TERRAIN.slope, f"inclination of the ground, rad, rising along x; 0 with slope: {DEFAULT_SLOPE_RAD}"
     )
