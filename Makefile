@@ -65,7 +65,7 @@ format: $(VENV)/.lint  ## format the code with ruff and apply its automatic fixe
 	$(VENV)/bin/ruff format
 
 docs: $(VENV)/.docs $(MERMAID)/.fetched  ## build the site, and run its tutorials; results in out/docs
-	$(PY) -m sphinx --builder html --fail-on-warning --keep-going docs out/docs
+	$(PY) -m sphinx --builder html --jobs auto --fail-on-warning --keep-going docs out/docs
 
 pictures: $(VENV)/.test  ## take the pictures of the documents again; needs an idle machine
 	$(PY) docs/pictures.py

@@ -24,7 +24,7 @@ MARK = re.compile(r"^<!-- code: (\w+) -->$", re.MULTILINE)
 REFERENCE = ROOT / "docs" / "reference"
 KINDS = ("Eq.", "Table", "Figure", "Section")
 CITATION = re.compile(r"(Eq\.|Table|Figure|Section) (\d+)")
-COLUMNS = 88
+COLUMNS = 64
 """Width of the help of a command, characters."""
 
 
