@@ -5,11 +5,11 @@ Two of them would send conflicting states and commands.
 
 from __future__ import annotations
 
+import fcntl
 import os
-import socket
-import struct
+import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from itertools import dropwhile
 from pathlib import Path
 from typing import Any
@@ -33,11 +33,11 @@ class RobotAlreadyRunningError(ConnectionError):
 
 @contextmanager
 def domain_claimed(node: Any) -> Iterator[None]:
-    """Claim this host's ROS domain for one robot, for as long as the context lasts.
+    """Claim a ROS domain of this computer for one robot, for as long as the context lasts.
 
     Without it, two programs that start at the same instant would both find no publisher. The claim is
-    a Unix socket with an abstract name: no file, shared by all users and by containers that share the
-    network, and freed by the kernel when the process ends, however it ends.
+    a lock on a file, which the kernel frees when the process ends, however it ends. It holds among
+    the programs of one user; those of others are found by what they publish.
 
     Args:
         node: A node that does not publish low_state itself; used at the start only.
@@ -49,13 +49,16 @@ def domain_claimed(node: Any) -> Iterator[None]:
         RobotAlreadyRunningError: Another program has claimed it, or low_state has a publisher; the
             sentence names its process.
     """
-    address = f"\0quadvel-robot-on-domain-{ros_domain()}"
-    with closing(socket.socket(socket.AF_UNIX)) as claim:
+    name = f"quadvel-user-{os.getuid()}-domain-{ros_domain()}.lock"
+    path = Path(tempfile.gettempdir(), name)
+    with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600), "r+") as claim:
         try:
-            claim.bind(address)
-        except OSError:  # EADDRINUSE
-            raise _already_published(_owner(address)) from None
-        claim.listen()
+            fcntl.flock(claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise _already_published(_owner(claim.read())) from None
+        claim.truncate()
+        claim.write(str(os.getpid()))
+        claim.flush()
         if has_publisher(node, TOPIC, LOADED_DISCOVERY_TIME_S if robots_on_domain() else DISCOVERY_TIME_S):
             raise _already_published(describe_robots())
         yield
@@ -94,18 +97,10 @@ def _already_published(by: str) -> RobotAlreadyRunningError:
     )
 
 
-def _owner(address: str) -> str:
-    """Name the program that listens at a Unix socket."""
-    with closing(socket.socket(socket.AF_UNIX)) as client:
-        client.setblocking(False)
-        try:
-            client.connect(address)
-        except OSError:  # it does not listen yet, or has just ended
-            return "another program"
-        credentials = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
-    pid, *_ = struct.unpack("3i", credentials)
-    words = _program(Path("/proc") / str(pid))
-    return f"{' '.join(words[:2]) or 'another program'} (pid {pid})"
+def _owner(pid: str) -> str:
+    """Name the program that has claimed a domain by its process id, "" in the instant before it is written."""
+    words = _program(Path("/proc", pid)) if pid else []
+    return f"{' '.join(words[:2])} (pid {pid})" if words else "another program"
 
 
 def _listed(robots: Mapping[int, str]) -> str:
