@@ -92,9 +92,8 @@ html_theme_options = {
     },
     "navbar_end": ["version-switcher", "theme-switcher", "navbar-icon-links"],
     "show_toc_level": 2,
-    "secondary_sidebar_items": {
-        "[!t]**": ["page-toc"]
-    },  # tutorials have none: their terminals need the width
+    # Tutorials have none: their terminals need the width.
+    "secondary_sidebar_items": {"[!t]**": ["page-toc"]},
     "footer_start": ["copyright"],
     "footer_end": [],
     "navigation_with_keys": False,
