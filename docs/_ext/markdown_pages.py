@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,11 @@ from typing import Any
 from code_reference import write_parts
 from repository_links import to_repository
 from sphinx.application import Sphinx
+from sphinx.directives.code import LiteralIncludeReader
 from sphinx.environment import BuildEnvironment
 
+INCLUDED = re.compile(r"^```\{literalinclude\} (\S+)\n((?::\w+:.*\n)*)```$", re.MULTILINE)
+OPTION = re.compile(r":(\w+): *(.*)")
 HEAD = "# quadvel\n\n> Learned velocity control of a quadruped robot on ROS 2.\n"
 
 
@@ -50,7 +54,15 @@ def write_markdown(app: Sphinx, error: Exception | None) -> None:
 
 def _write_page(app: Sphinx, page: str) -> None:
     """Write the Markdown of a page, with the parts that come from the code."""
-    source = [Path(app.env.doc2path(page)).read_text(encoding="utf-8")]
+    path = Path(app.env.doc2path(page))
+
+    def include(found: re.Match[str]) -> str:
+        options = dict(OPTION.findall(found[2]))
+        file = path.parent / found[1]
+        text, _ = LiteralIncludeReader(str(file), options, app.config).read()
+        return f"```{options.get('language', file.suffix[1:])}\n{text.rstrip()}\n```"
+
+    source = [INCLUDED.sub(include, path.read_text(encoding="utf-8"))]
     write_parts(app, page, source)
     to_repository(app, page, source)
     target = Path(app.outdir, f"{page}.md")

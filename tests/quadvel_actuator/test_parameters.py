@@ -1,10 +1,11 @@
 """The actuator parameter file: Table 4, round trip, and errors that name field and value."""
 
 import attrs
+import numpy as np
 import pytest
 import yaml
 
-from quadvel_actuator import ActuatorParameters, DelayPair, Effect
+from quadvel_actuator import ActuatorModel, ActuatorParameters, DelayPair, Effect
 from tests.helpers.robots import ALIENGO, GO2
 
 
@@ -115,3 +116,41 @@ def test_a_file_of_some_joints_is_refused_where_all_are_needed(tmp_path):
         ValueError, match=r"few.yaml: joints: found 2 \(FR_hip_joint, FR_thigh_joint\), expected all 12"
     ):
         ActuatorParameters.load(ALIENGO, tmp_path / "few.yaml")
+
+
+def test_the_drive_of_a_bench_moves_every_joint_of_a_robot(tmp_path):
+    bench = attrs.evolve(
+        ActuatorParameters.of(ALIENGO),
+        joints=["knee"],
+        torque_noise=0.0,
+        delta_kp=[-3.0],
+        delta_kd=0.1,
+        torque_limit=[5.0],
+        effects=(
+            Effect(
+                name="coulomb_friction",
+                joints=["knee"],
+                parameters={"c": [0.8], "v_0": 0.02},
+                intervals={"c": [[0.7, 0.9]], "v_0": [0.01, 0.03]},
+            ),
+        ),
+    )
+    bench.on_all_joints(GO2).save(tmp_path / "twelve.yaml")
+    twelve = ActuatorParameters.load(GO2, tmp_path / "twelve.yaml")
+    drives = ActuatorModel(twelve, shape=(12,), dt=1e-3, seed=0)
+    one = ActuatorModel(attrs.evolve(bench, torque_limit=40.0), shape=(1,), dt=1e-3, seed=0)
+    for _ in range(40):
+        expected = one.step(q=np.zeros(1), dq=np.ones(1), q_des=0.3 * np.ones(1), kp=30.0, kd=0.5)
+        torque = drives.step(q=np.zeros(12), dq=np.ones(12), q_des=0.3 * np.ones(12), kp=30.0, kd=0.5)
+    np.testing.assert_allclose(torque, np.full(12, expected.item()), atol=1e-12)
+    np.testing.assert_array_equal(twelve.torque_limit, GO2.torque_limit)
+    with pytest.raises(ValueError, match="joints: found .* expected one joint"):
+        twelve.on_all_joints(GO2)
+
+
+def test_an_effect_that_reads_another_joint_is_not_spread(tmp_path):
+    effect = Effect(name="x", joints=["knee"], parameters={"source": ["ankle/dq"], "w": 1.0})
+    with pytest.raises(ValueError, match="expected an effect that names no other joint"):
+        attrs.evolve(
+            ActuatorParameters.of(ALIENGO), joints=["knee"], delta_kp=0.0, delta_kd=0.0, effects=(effect,)
+        ).on_all_joints(ALIENGO)

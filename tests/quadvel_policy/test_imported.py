@@ -20,6 +20,7 @@ import yaml
 from onnx import TensorProto, helper, numpy_helper
 
 from quadvel_bringup import cli
+from quadvel_bringup.import_policy import import_command
 from quadvel_description.kinematics import rotate
 from quadvel_description.network_file import NetworkFileError
 from quadvel_description.quadruped import JOINT_NAMES
@@ -492,6 +493,18 @@ def imported(tmp_path: Path) -> Path:
     out = tmp_path / "out.onnx"
     import_policy(GO2, tmp_path / "policy.onnx", write_yaml(tmp_path / "deploy.yaml", DEPLOY), out)
     return out
+
+
+def test_the_command_prints_what_it_read_of_each_joint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_network(tmp_path / "policy.onnx", 75)
+    deploy = {**DEPLOY, "stiffness": [20.0 + i for i in range(12)]}
+    config = write_yaml(tmp_path / "deploy.yaml", deploy)
+    import_command(tmp_path / "policy.onnx", tmp_path / "out.onnx", "go2", config, None, None)
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if "_joint " in line]
+    assert [row[1] for row in rows] == motors(DEPLOY["joint_ids_map"])
+    assert [float(row[-2]) for row in rows] == [20.0 + motor for motor in DEPLOY["joint_ids_map"]]
 
 
 def test_an_imported_file_loads_for_its_robot_alone(imported: Path) -> None:

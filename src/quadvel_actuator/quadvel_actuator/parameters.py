@@ -82,6 +82,26 @@ class Effect:
             raise refusal(self, "joints", self.joints, "names of joints")
 
 
+def _on_all_joints(effect: Effect) -> Effect:
+    """Extend an effect of one joint to the joints of a robot."""
+    words = [name for name, value in effect.parameters.items() if np.asarray(value).dtype.kind == "U"]
+    if any("/" in str(effect.parameters[name]) for name in words):
+        raise refusal(effect, "parameters", dict(effect.parameters), "an effect that names no other joint")
+    return attrs.evolve(
+        effect,
+        joints=JOINT_NAMES,
+        parameters={
+            name: value if name in words else _only(value) for name, value in effect.parameters.items()
+        },
+        intervals={name: np.reshape(pair, 2).tolist() for name, pair in effect.intervals.items()},
+    )
+
+
+def _only(value: Any) -> float:
+    """Return the only one of some numbers."""
+    return float(np.reshape(value, -1).item())
+
+
 @attrs.frozen(kw_only=True)
 class ActuatorParameters:
     """Parameters of the empirical actuator model (Eq. 1 and 2 of the paper), in SI units.
@@ -164,7 +184,8 @@ class ActuatorParameters:
         if not some_joints and len(names := parameters.joints or JOINT_NAMES) != len(JOINT_NAMES):
             raise ValueError(
                 f"{path}: joints: found {len(names)} ({', '.join(names)}), expected all {len(JOINT_NAMES)} of the "
-                "robot: identify logs of all of them, without --joints"
+                "robot: identify logs of all of them, without --joints, or give the drive of one joint to all "
+                "(ActuatorParameters.on_all_joints, tutorial 3)"
             )
         return parameters
 
@@ -182,6 +203,30 @@ class ActuatorParameters:
             text = yaml.safe_dump({key: value}, default_flow_style=flow, sort_keys=False, width=110)
             lines.append(text.rstrip())
         Path(path).write_text("\n".join(lines) + "\n")
+
+    def on_all_joints(self, robot: Robot) -> ActuatorParameters:
+        """Give the drive of one joint, as a test bench measures it, to every joint of a robot.
+
+        Args:
+            robot: The robot, which keeps its torque limits.
+
+        Returns:
+            The parameters of the robot.
+
+        Raises:
+            ValueError: These are of more joints than one, or an effect names another joint.
+        """
+        if len(self.joints) != 1:
+            raise refusal(self, "joints", self.joints or JOINT_NAMES, "one joint")
+        return attrs.evolve(
+            self,
+            robot=robot.name,
+            delta_kp=_only(self.delta_kp),
+            delta_kd=_only(self.delta_kd),
+            torque_limit=tuple(robot.torque_limit.tolist()),
+            effects=tuple(_on_all_joints(effect) for effect in self.effects),
+            joints=(),
+        )
 
     @classmethod
     def of(cls, robot: Robot) -> ActuatorParameters:

@@ -23,13 +23,19 @@ ARGUMENTS = [
         "low_level", default_value="sim", choices=list(LOW_LEVELS), description="simulated or real robot"
     ),
     DeclareLaunchArgument(
-        "robot", default_value="", description="aliengo, go2 or the folder of a robot; empty: aliengo"
+        "robot", default_value="", description="aliengo, go2, or a robot.yaml or its folder; empty: aliengo"
     ),
     DeclareLaunchArgument("policy", default_value="", description="ONNX file; empty: the shipped one"),
     DeclareLaunchArgument(
         "actuator",
         default_value="",
         description="YAML file of an actuator model, as identify writes it; empty: the shipped one",
+    ),
+    DeclareLaunchArgument(
+        "estimator",
+        default_value="",
+        choices=["", "learned", "kalman"],
+        description="estimator of the linear velocity; empty: as in params",
     ),
     DeclareLaunchArgument("terrain", default_value="", description="flat, slope or rough; empty: flat"),
     DeclareLaunchArgument(
@@ -62,6 +68,7 @@ def start(context: LaunchContext) -> list[Action]:
         robot=chosen["robot"] or None,
         policy=Path(chosen["policy"]) if chosen["policy"] else None,
         actuator=Path(chosen["actuator"]) if chosen["actuator"] else None,
+        estimator=chosen["estimator"] or None,
         terrain=chosen["terrain"] or None,
         world=chosen["world"] or None,
         parameters=Path(chosen["params"]),

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from quadvel_description.quadruped import JOINT_NAMES
 from quadvel_description.robot import load_robot
 from quadvel_policy.imported.importer import Supplement, import_policy
+from quadvel_policy.imported.metadata import ImportedMetadata
 from quadvel_recordings.output import atomic_write, output_file
 
 
@@ -63,4 +66,24 @@ def import_command(
         draft.write_bytes(content)
     terms = ", ".join(f"{term.name} x {len(term.ages)}" for term in metadata.terms)
     print(f"{metadata.source}: {metadata.size} numbers at {metadata.rate_hz:g} Hz: {terms}")
+    for line in _joint_table(metadata):
+        print(line)
+    for axis, (low, high) in metadata.command_limits.items():
+        print(f"command {axis}: {low:g} to {high:g} {'rad/s' if axis == 'wz' else 'm/s'}")
+    if any(term.name == "linear_velocity" for term in metadata.terms):
+        print(
+            "it observes the linear velocity: run it with --estimator kalman, as the learned estimator knows the "
+            "gait of the shipped policy only"
+        )
     print(f"written: {out}")
+
+
+def _joint_table(metadata: ImportedMetadata) -> Iterator[str]:
+    """Yield a line for each output of the network: joint, posture, target = offset + scale x action, gains."""
+    yield "action  joint            posture, rad   target, rad           kp, N m/rad  kd, N m s/rad"
+    for number, joint in enumerate(metadata.joint_map):
+        target = f"{metadata.action_offset[joint]:+.3f} {metadata.action_scale[joint]:+.3f} a"
+        yield (
+            f"{number:6}  {JOINT_NAMES[joint]:15}  {metadata.nominal_q[joint]:+12.3f}   {target:20}  "
+            f"{metadata.kp[joint]:11g}  {metadata.kd[joint]:13g}"
+        )

@@ -48,7 +48,8 @@ class ImportedPolicy:
             raise NetworkFileError(str(error)) from None
         if self.metadata.robot != robot.name:
             raise NetworkFileError(
-                f"{path}: metadata field robot is {self.metadata.robot!r}, expected {robot.name!r}"
+                f"{path}: metadata field robot is {self.metadata.robot!r}, expected {robot.name!r}, the robot "
+                "that is started (--robot)"
             )
         self._path, self._output = path, self.metadata.output
         self._session = open_session(path, model)
