@@ -144,7 +144,7 @@ def test_the_drive_of_a_bench_moves_every_joint_of_a_robot(tmp_path):
         torque = drives.step(q=np.zeros(12), dq=np.ones(12), q_des=0.3 * np.ones(12), kp=30.0, kd=0.5)
     np.testing.assert_allclose(torque, np.full(12, expected.item()), atol=1e-12)
     np.testing.assert_array_equal(twelve.torque_limit, GO2.torque_limit)
-    with pytest.raises(ValueError, match="joints: found .* expected one joint"):
+    with pytest.raises(ValueError, match=r"joints: found .* expected one joint"):
         twelve.on_all_joints(GO2)
 
 
