@@ -25,7 +25,8 @@ from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import MotorStatus, TickInput
 from quadvel_recordings.definitions import STORE
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from tests.helpers.robots import ALIENGO
 
 TICK_MS = 5

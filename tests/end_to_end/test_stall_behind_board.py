@@ -20,8 +20,9 @@ from quadvel_policy.observation import RATE_HZ
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.bad_network import NetworkConfig
+from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.loop import SimulationLoop
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from quadvel_sim.udp_board import UdpBoard
 from tests.helpers.robots import ALIENGO
 

@@ -25,7 +25,8 @@ from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_eval import robot_check
 from quadvel_eval.robot_loop import RobotLoop
 from quadvel_policy.supervisor import Supervisor
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from tests.helpers.robots import GO2
 from tests.helpers.third_robot import (
     BASH,

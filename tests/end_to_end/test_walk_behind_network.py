@@ -22,7 +22,8 @@ from quadvel_eval.robot_loop import RobotLoop
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.bad_network import BadNetwork, NetworkConfig
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from tests.helpers.robots import ALIENGO, GO2
 
 BAD = NetworkConfig(network_loss=0.02, network_jitter=0.002)

@@ -12,7 +12,8 @@ from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_eval.robot_loop import RobotLoop, TrueVelocity
 from quadvel_policy.observation import PolicyMetadata, default_observation
 from quadvel_policy.supervisor import Supervisor
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from tests.helpers.robots import ALIENGO
 
 

@@ -19,8 +19,9 @@ from quadvel_eval.paper.robustness import Robustness, conditions
 from quadvel_eval.paper.section import Study
 from quadvel_eval.paper.slopes import MAX_FOLLOWING_ERROR, STARTS, TITLES, Slopes
 from quadvel_eval.segments import Segment
+from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.physics import HELD_OUT_PHYSICS
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from tests.helpers.robots import ALIENGO
 
 

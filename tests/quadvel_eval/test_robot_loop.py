@@ -11,7 +11,8 @@ from quadvel_description.state import JointCommand
 from quadvel_eval.robot_loop import RobotLoop, Sample, TrueVelocity, make_estimator
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import TickInput
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from tests.helpers.robots import ALIENGO
 
 

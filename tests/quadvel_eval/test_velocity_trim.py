@@ -11,7 +11,8 @@ from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.observation import CONTROL_PERIOD_S
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from tests.helpers.robots import ALIENGO
 
 AHEAD, WALK_S, EVALUATED_S = (1.0, 0.0, 0.0), 7.0, 3.0

@@ -14,7 +14,8 @@ from quadvel_description.mjcf import Plant, load_model
 from quadvel_description.quadruped import GRAVITY, JOINT_NAMES, LEGS
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_lab.excite import MotionPlayer
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from quadvel_sysid.excitation import PERIOD_S, Excitation, FootLifting, Sweep
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log

@@ -13,7 +13,8 @@ from quadvel_description import mjcf
 from quadvel_policy.config import SupervisorConfig
 from quadvel_policy.supervisor import Supervisor
 from quadvel_policy.tick_input import TickInput
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from quadvel_sim.terrain import Terrain
 from tests.helpers.robots import ALIENGO
 

@@ -20,8 +20,9 @@ from quadvel_driver.link import NO_CALIBRATION, Link
 from quadvel_driver.udp import UdpConfig, UdpTransport
 from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.board import Board, BoardError
+from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.loop import SimulationLoop
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from quadvel_sim.udp_board import UdpBoard
 from tests.helpers.boards import running, wait_for
 from tests.helpers.robots import ALIENGO

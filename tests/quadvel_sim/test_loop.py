@@ -11,8 +11,9 @@ import pytest
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_description.state import MODE_SERVO, JointCommand, RobotState
+from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.loop import SimulationLoop
-from quadvel_sim.simulator import SensorNoise, Simulator, SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from tests.helpers.robots import ALIENGO
 
 

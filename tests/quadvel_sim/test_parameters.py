@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from quadvel_actuator import ActuatorParameters
+from quadvel_sim.config import SensorNoise
 from quadvel_sim.parameters import SimParameters
-from quadvel_sim.simulator import SensorNoise
 from quadvel_sim.terrain import Terrain
 from tests.helpers.robots import ALIENGO
 

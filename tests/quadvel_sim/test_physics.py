@@ -6,8 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.physics import HELD_OUT_PHYSICS, Physics
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from tests.helpers.robots import ALIENGO
 
 

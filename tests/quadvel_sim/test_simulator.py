@@ -13,7 +13,8 @@ from quadvel_description.kinematics import foot_positions, rotate, rotate_invers
 from quadvel_description.mjcf import gravity_torque
 from quadvel_description.quadruped import GRAVITY, LEGS
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
-from quadvel_sim.simulator import DT, SensorNoise, Simulator, SimulatorConfig
+from quadvel_sim.config import SensorNoise, SimulatorConfig
+from quadvel_sim.simulator import DT, Simulator
 from quadvel_sim.terrain import Terrain
 from tests.helpers.robots import ALIENGO
 

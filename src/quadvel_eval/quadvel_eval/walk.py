@@ -25,7 +25,8 @@ from quadvel_estimator.learned import shipped_estimator
 from quadvel_policy.observation import CONTROL_PERIOD_S
 from quadvel_policy.policy_file import load_policy, shipped_policy
 from quadvel_policy.supervisor import Supervisor
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from quadvel_sim.terrain import Terrain
 
 from .robot_loop import RobotLoop, Sample, make_estimator

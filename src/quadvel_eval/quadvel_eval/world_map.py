@@ -20,7 +20,8 @@ from rich.console import Console
 from quadvel_description.robot import load_robot
 from quadvel_description.robot_name import DEFAULT_ROBOT
 from quadvel_recordings.output import output_file
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from quadvel_sim.world import SHIPPED_WORLDS, World
 
 from .report import write_figure

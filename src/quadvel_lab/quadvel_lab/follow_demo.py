@@ -24,7 +24,8 @@ from quadvel_eval.following.tour import load_followed_world
 from quadvel_eval.following.tour_report import tour_table, write_tour
 from quadvel_recordings.output import atomic_write
 from quadvel_recordings.reading import RecordingError
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
 
 from .recorded_run import LOCKSTEP_HINT, RecordedRun
 

@@ -27,12 +27,10 @@ from quadvel_description.mjcf import Plant, build_spec
 from quadvel_description.quadruped import JOINT_NAMES, LEGS, joint_index
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_sim import persons
-from quadvel_sim.config import SensorNoise, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.laser import Scan
 from quadvel_sim.surroundings import Surroundings, is_ground
 from quadvel_sim.world_parts import SURFACE_PRIORITY
-
-__all__ = ["DT", "SensorNoise", "Simulator", "SimulatorConfig", "Truth"]
 
 DT = 0.001
 """Time step, s."""

@@ -25,7 +25,8 @@ from quadvel_follow.pose_history import PoseHistory
 from quadvel_policy.observation import CONTROL_PERIOD_S as TICK
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from quadvel_sim.world import World
 
 from ..robot_loop import RobotLoop, Sample, make_estimator

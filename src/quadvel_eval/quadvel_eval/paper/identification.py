@@ -20,7 +20,8 @@ from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_policy.observation import CONTROL_PERIOD_S, VelocityCommandLimits
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
-from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
 from quadvel_sysid.excitation import FootLifting, limit_torque
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log
