@@ -41,7 +41,7 @@ def commands() -> str:
     parts = []
     for name in cli.command_names():
         shown = CliRunner().invoke(
-            cli.app, [*name.split(), "--help"], env={"COLUMNS": str(COLUMNS)}, prog_name="quadvel"
+            cli.app, [*name.split(), "--help"], terminal_width=COLUMNS, prog_name="quadvel"
         )
         parts.append(f"## quadvel {name}\n\n{_fenced(shown.output, 'text')}")
     return "\n".join(parts)
