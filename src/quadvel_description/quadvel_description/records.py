@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, get_origin
@@ -15,6 +15,7 @@ from cattrs.gen import make_dict_structure_fn
 
 from .bounded_yaml import read_yaml
 from .fields import Numbers
+from .name_list import format_names
 
 Record = TypeVar("Record")
 PLAIN_TYPES: Mapping[type, tuple[tuple[type, ...], str]] = {
@@ -78,13 +79,9 @@ def _check_kind(kind: type, fields: Mapping[str, Any], prefix: str) -> None:
     required = [field.name for field in attrs.fields(kind) if field.default is attrs.NOTHING]
     missing = [name for name in required if name not in fields]
     if fields and len(missing) > max(1, len(required) // 2):
-        raise ValueError(f"{prefix}found the fields {_some(fields)}, expected {_some(required)}")
-
-
-def _some(names: Collection[str]) -> str:
-    """List the first of some names."""
-    first, more = [*names][:4], len([*names]) - 4
-    return ", ".join(first) + (f" and {more} more" if more > 0 else "")
+        raise ValueError(
+            f"{prefix}found the fields {format_names([*fields])}, expected {format_names(required)}"
+        )
 
 
 def _explain(error: BaseException, kind: type | None) -> str:

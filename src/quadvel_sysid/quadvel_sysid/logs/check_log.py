@@ -9,11 +9,12 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Bools
+from quadvel_description.name_list import format_names
 
 from .checks import response
 from .checks.pd_control import explainable_rows
 from .checks.table import MOTION_CHECKS, RESPONSE_CHECKS, ROW_CHECKS, Check
-from .findings import Finding, format_names
+from .findings import Finding
 from .log import Log, LogError
 
 

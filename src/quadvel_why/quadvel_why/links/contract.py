@@ -9,6 +9,7 @@ from scipy.optimize import linear_sum_assignment
 from typing_extensions import override
 
 from quadvel_description.arrays import Array
+from quadvel_description.name_list import format_names
 
 from ..cause import NOTHING, Cause, Link, Measurement, Trace, worst_span
 from ..explanation import AGREES_RAD, Explanation
@@ -246,13 +247,12 @@ class JointOrder(Cause):
         if len(moved) >= 2:
             j = int(moved[np.argmax(gain[moved])])
             i = int(source[j])
-            listed = ", ".join(f"{run.joints[a]} follows {run.joints[source[a]]}" for a in moved[:4])
-            more = f" and {len(moved) - 4} more" if len(moved) > 4 else ""
+            listed = format_names([f"{run.joints[a]} follows {run.joints[source[a]]}" for a in moved])
             rows = np.maximum(run.command_rows(exact.delay), 0)
             other = run.commands.kp[rows, i] * (run.commands.q[rows, i] - run.q[:, j])
             other -= run.commands.kd[rows, i] * run.dq[:, j]
             sentence = (
-                f"{listed}{more}: the torque of {run.joints[j]} is {math.sqrt(best[j]):.1f} N m off that command, "
+                f"{listed}: the torque of {run.joints[j]} is {math.sqrt(best[j]):.1f} N m off that command, "
                 f"{math.sqrt(own[j]):.1f} N m off its own"
             )
             trace = joint_trace(signals, j, other)

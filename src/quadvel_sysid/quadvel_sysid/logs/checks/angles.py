@@ -12,9 +12,10 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Bools, Floats
+from quadvel_description.name_list import format_names
 from quadvel_description.quadruped import JOINT_NAMES
 
-from ..findings import Finding, Kind, format_names
+from ..findings import Finding, Kind
 from ..log import Log
 from .channels import (
     DEGREE_RAD,

@@ -12,9 +12,10 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Bools, Floats, Indices
+from quadvel_description.name_list import format_names
 from quadvel_description.quadruped import JOINT_NAMES
 
-from ..findings import Finding, format_names
+from ..findings import Finding
 from ..log import Log
 
 MAX_ROWS = 20_000

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadvel_description.arrays import Array
+from quadvel_description.name_list import format_names
 
-from ..findings import Finding, format_names
+from ..findings import Finding
 from ..log import Log
 from .channels import MOVING_SPAN_RAD, sample_rows
 from .response import least_squares_residual, motion_regressors

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadvel_description.arrays import Bools, Floats, Indices
+from quadvel_description.name_list import format_names
 
-from ..findings import Finding, format_names
+from ..findings import Finding
 from ..log import TIME_TOLERANCE_S, Log
 from .response import motion_regressors
 
@@ -338,5 +339,4 @@ def format_spans(spans: list[tuple[float, float]], t: Floats, most: int = 4) -> 
         f"{first:.2f} s to the end" if last >= t[-1] else f"{first:.2f} to {last:.2f} s"
         for first, last in spans
     ]
-    rest = f" and {len(texts) - most} more" if len(texts) > most else ""
-    return ", ".join(texts[:most]) + rest
+    return format_names(texts, most)

@@ -15,8 +15,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from quadvel_description.arrays import Bools, Floats, Indices
+from quadvel_description.name_list import format_names
 
-from ..findings import Finding, format_names
+from ..findings import Finding
 from ..log import Log
 from .channels import DEGREE_RAD, MOVING_SPAN_RAD, TURN_RAD, resting
 

@@ -11,8 +11,9 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Bools, Floats, Indices
+from quadvel_description.name_list import format_names
 
-from ..findings import Finding, format_names
+from ..findings import Finding
 from ..log import Log
 from .channels import TURN_RAD, sample_rows
 from .response import EXPLAINED_ERROR_SHARE, TIME_ROUNDING_S, least_squares_residual, motion_regressors

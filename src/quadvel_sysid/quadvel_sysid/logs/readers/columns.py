@@ -30,8 +30,8 @@ import numpy as np
 
 from quadvel_description.arrays import Floats
 from quadvel_description.bounded_yaml import read_yaml
+from quadvel_description.name_list import format_names
 
-from ..findings import format_names
 from ..log import LogError, joint_name
 from . import files
 from .names import ALL_JOINTS, FIELDS, JOINT_NAMES_FIELD, resolve_columns

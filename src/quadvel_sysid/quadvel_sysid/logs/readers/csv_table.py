@@ -22,8 +22,8 @@ import attrs
 import numpy as np
 
 from quadvel_description.arrays import Floats
+from quadvel_description.name_list import format_names
 
-from ..findings import format_names
 from ..log import LogError
 from . import units
 from .names import TIME_FIELDS

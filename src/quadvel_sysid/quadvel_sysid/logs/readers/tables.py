@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from quadvel_description.arrays import Bools, Floats
+from quadvel_description.name_list import format_names
 from quadvel_description.quadruped import JOINT_NAMES
 
-from ..findings import format_names
 from ..log import Log, LogError, joint_name
 from .columns import UNUSED, ColumnMap, count_whole_rows, read_fields
 from .raw import check_size
